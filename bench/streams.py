@@ -20,7 +20,7 @@ from typing import Any
 
 import plushsense as ps
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.streams.run import stream_benchmark
+from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
 from plushsense.experiments.streams.score import CHOICES
 from plushsense.experiments.streams.systems import ANYWHERE
 from plushsense.workflow.config import RunConfig, from_settings
@@ -82,7 +82,7 @@ def benchmark(dataset: Dataset, row: Row, seed: int, workers: int) -> dict[str, 
     config = replace(config, evaluation=replace(config.evaluation, workers=workers))
     # The reference is needed for the interpolation at equal recall.
     systems = list(dict.fromkeys(["smoothed", row.system]))
-    return stream_benchmark(dataset, config, systems=systems, anywhere_pool_s=row.pool_s)
+    return stream_benchmark(dataset, config, BenchmarkSpec(systems=systems, anywhere_pool_s=row.pool_s))
 
 
 def figures(row: Row, result: dict[str, Any]) -> dict[str, Any]:

@@ -25,14 +25,14 @@ import numpy as np
 
 import plushsense as ps
 from plushsense.core.errors import PlushSenseError
-from plushsense.experiments.baselines.run import baselines
+from plushsense.experiments.baselines.run import ComparisonSpec, baselines
 from plushsense.experiments.baselines.score import UNSCALED, Pca, reads
+from plushsense.experiments.sweep.grid import CHOSEN
 from plushsense.experiments.sweep.report import training_settings
 from plushsense.experiments.sweep.results import read_sweep
 from plushsense.experiments.sweep.run import sweep
 from plushsense.experiments.sweep.tables import TABLE4
 from plushsense.scoring.splits import make_folds, parse_split
-from plushsense.trials.grid import CHOSEN
 from plushsense.windows.cut import WindowSpec
 
 UNTESTED = "Untested on the original archive, which was not available to this project."
@@ -110,7 +110,7 @@ class Paper:
         if not (folder / "dataset.toml").is_file():
             done = ps.import_recordings(archive, folder, layout="plush-15", name="the paper's archive", **given)
             for entry in done.rejected:
-                say(f"rejected: {entry['file']}: {entry['reason']}")
+                say(f"rejected: {entry.file}: {entry.reason}")
         else:
             say(f"using the data set '{folder}' that an earlier run imported")
         self.dataset = ps.open_dataset(folder)
@@ -171,7 +171,7 @@ class Paper:
             out=self.out / "sweeps" / f"{symbol}-{self.seeds}-{grid}{'-quick' * self.quick}",
         )
         results = read_sweep(swept.out)
-        described = [("Split", swept.summary["split"]), ("Context", swept.summary["context"])]
+        described = [("Split", swept.head.split), ("Context", swept.head.context)]
         described += [("Padding", swept.trials["padding"][0]), *training_settings(results)]
         self.settings[grid] = "; ".join(f"{key.lower()}: {value}" for key, value in described)
         tested = swept.runs["test_windows"][0]
@@ -216,21 +216,24 @@ class Paper:
         for features, pca in choices.items():
             result = baselines(
                 self.dataset,
-                splits=("windows:5",),
-                models=dict.fromkeys(name for name, read, _ in BASELINES if read == features),
-                features=(features,),
-                pca=pca,
+                spec=ComparisonSpec(
+                    ("windows:5",),
+                    list(dict.fromkeys(name for name, read, _ in BASELINES if read == features)),
+                    (features,),
+                    pca,
+                ),
                 context="rows",
                 classes="all",
             )
-            for row in result["models"]:
-                printed = BASELINES[key := (row["name"], features, row["pca"])]
+            for row in result.models:
+                printed = BASELINES[key := (row.name, features, row.pca)]
+                accuracy = row.metrics["accuracy"]
                 ours[key] = Row(
                     "baselines",
-                    f"{row['title']} on {reads(features, row['pca'])} ({LEAKY})",
+                    f"{row.title} on {reads(features, row.pca)} ({LEAKY})",
                     "-" if printed is None else f"{printed:.1f} %",
-                    f"{100 * row['accuracy']['mean']:.1f} % ± {100 * row['accuracy']['sd']:.1f}",
-                    f"{row['folds']} folds, {result['windows']} windows",
+                    f"{100 * accuracy['mean']:.1f} % ± {100 * accuracy['sd']:.1f}",
+                    f"{row.folds} folds, {result.windows} windows",
                 )
         return [ours[key] for key in BASELINES if key in ours]
 
@@ -252,7 +255,7 @@ class Paper:
             progress=lambda p: say(f"  fold {p.done} of {p.total} done") if p.epoch == 0 else None,
             **more,
         )
-        return result.to_dict()
+        return result.to_json()
 
 
 def say(text: str) -> None:

@@ -219,21 +219,20 @@ SMALL = {
     "verify": {"--target": "host"},
     "verify --dataset": {"--samples": "500"},
     "profile": {"--target": "host"},
-    "search": {"--rungs": "1,2", "--share": "1", "--architectures": "14d1_39d2_41d4", "--filters": "4/6/8/8"},
     "sweep": {
         "--architectures": "14d1_39d2_41d4,19d1_19d2_19d4_17d8",
         "--filters": "4/6/8/8",
         "--batches": "64",
     },
+    "sweep --halving": {"--epochs": "!1,2", "--share": "1"},
 }
 # Where a verb writes a new folder or file, which must not be there.
 NEW = {
     "import": "dest",
     "simulate": "out dataset",
     "export": "out",
-    "pseudonymise": "out",
+    "publish": "out",
     "backup": "file",
-    "restore": "dest",
     "merge": "out",
 }
 # What stands on the pages for something that is not here, and what stands in for it.

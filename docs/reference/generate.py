@@ -36,15 +36,12 @@ from plushsense.dataset.labelling import COLUMNS as LABEL_COLUMNS
 from plushsense.dataset.store import PEOPLE_COLUMNS, DatasetHead
 from plushsense.devices.virtual.faults import FAULTS
 from plushsense.devices.virtual.scenario import ACTIONS, ToyScenario, load_scenario
-from plushsense.experiments.search.halving import DEFAULTS as SEARCH_DEFAULTS
-from plushsense.experiments.search.halving import SearchSpec, Space, load_search
-from plushsense.experiments.search.halving import problems as search_problems
 from plushsense.experiments.streams.predictions import EVENT_COLUMNS
+from plushsense.experiments.sweep.grid import GridSpec, load_grid
+from plushsense.experiments.sweep.grid import problems as grid_problems
 from plushsense.live.reactions import ReactionsFile, load_reactions
 from plushsense.recording.plan import ProtocolFile, load_protocol
 from plushsense.training.spec import CONTEXT, PADDING, PRESETS
-from plushsense.trials.grid import GridSpec, load_grid
-from plushsense.trials.grid import problems as grid_problems
 from plushsense.workflow.config import TABLES, resolve
 
 PAGES = Path(__file__).parent
@@ -52,10 +49,9 @@ EXAMPLES = PAGES.parents[1] / "examples" / "files"
 
 
 def _read_grid(path: Path) -> GridSpec:
-    """Read both tables of a grid file; raise ConfigError for the first problem."""
+    """Read a grid file; raise ConfigError for the first problem."""
     grid, problems = load_grid(path)
-    searched, search, more = load_search(path)
-    for problem in (*problems, *more, *grid_problems(grid), *grid_problems(searched), *search_problems(search)):
+    for problem in (*problems, *grid_problems(grid)):
         raise ConfigError(problem)
     return grid
 
@@ -90,15 +86,6 @@ def _presets() -> str:
     rows |= {"padding": [_toml(PADDING[n]) for n in PRESETS], "context": [_toml(CONTEXT[n]) for n in PRESETS]}
     head = _row("key", *(f"`{name}`" for name in PRESETS)) + _row(*["---"] * (len(PRESETS) + 1))
     return "## Presets\n\n" + head + "".join(_row(f"`{key}`", *(v or "none" for v in row)) for key, row in rows.items())
-
-
-def _search_defaults() -> str:
-    """Return what `plushsense search` takes where a grid file has no key."""
-    keys = ", ".join(f"`{key} = {_toml(value).strip('`')}`" for key, value in SEARCH_DEFAULTS.items())
-    return (
-        f"## With `plushsense search`\n\nThe defaults of `[grid]` are those of the paper's sweep. `plushsense search` "
-        f"has others: {keys}; its epochs are the `rungs`.\n"
-    )
 
 
 def _actions_and_faults() -> str:
@@ -177,12 +164,10 @@ FILES = {
     ),
     "grid": FileKind(
         "Grid file: many networks to compare",
-        "A grid lists the networks and settings that [`sweep`](../sweep.md) and [`search`](../network-search.md) train "
-        "and compare: `--grid FILE`. The table `[grid]` must be there, its keys may be left out; `[search]` is for "
-        "`search` alone.",
-        {"grid": GridSpec, "search": SearchSpec, "search.space": Space},
+        "A grid lists the networks and settings that [`sweep`](../sweep.md) trains and compares: `--grid FILE`. The "
+        "table `[grid]` must be there, its keys may be left out; the defaults are those of the paper's sweep.",
+        {"grid": GridSpec},
         _read_grid,
-        _search_defaults,
     ),
     "dataset": FileKind(
         "Data set head: `dataset.toml`",

@@ -190,9 +190,10 @@ def test_people_left_out(cli: Cli, make_session: Make, tmp_path: Path) -> None:
     rows = {row["subject"]: row for row in found["engines"]["float"]["people"]}
     assert rows["P2"]["right_change"] > 1.0 and rows["P2"]["recordings"] == 6.0
     assert 0.5 < found["agreement"]["after"] <= 1.0
-    assert "trained for" in ran.err
+    assert "adapting: 3 of 3 folds, 100%" in ran.err
+    assert cli(*words).json == found
     again = cli(*words[:-1])
-    assert again.status == 0 and "trained for" not in again.err and "macro-F1 gain" in again.out
+    assert again.status == 0 and "3 of 3 folds (3 from before)" in again.err and "macro-F1 gain" in again.out
     assert cli("adapt", "--evaluate", made.path, "--split", "by-recording:2").status == 2
     assert cli("adapt", "model.plush", "--evaluate", made.path).status == 2
 

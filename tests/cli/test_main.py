@@ -49,8 +49,7 @@ def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> N
     [
         ["--help"],
         ["arch", "14d1", "--filters", "8"],
-        ["search", "no-such-folder"],
-        *([v, "--help"] for v in ("info", "sweep", "search", "baselines")),
+        *([v, "--help"] for v in ("info", "sweep", "baselines")),
     ],
 )
 def test_light_verbs_load_nothing_heavy(words: list[str]) -> None:
@@ -255,7 +254,7 @@ def test_bad_input_is_one_sentence_and_status_2(
     [
         (["train", "DS", "--out", "FILE", "--force"], "workflow.api.train", "is not a bundle"),
         (["adapt", "BUNDLE", "DS", "--out", "FILE", "--force"], "experiments.adaptation.adapt", "is not a bundle"),
-        (["label", "DS", "--export", "FILE"], "dataset.labelling.decide_labels", "is not a file of labels"),
+        (["check", "DS", "--save-labels", "FILE"], "dataset.labelling.decide_labels", "is not a file of labels"),
         (
             ["stream-eval", "DS", "--model", "BUNDLE", "--events", "FILE"],
             "experiments.streams.run.streams_at",
@@ -288,7 +287,7 @@ def test_links_to_themselves_and_pipes_are_refused(cli: Cli, recordings: Path, t
     os.mkfifo(tmp_path / "pipe")
     for words, said in (
         (("import", recordings, tmp_path / "loop", "--layout", "accel-3"), "link"),
-        (("restore", tmp_path / "pipe", tmp_path / "DS"), "is no file: give a backup"),
+        (("backup", "--restore", tmp_path / "pipe", tmp_path / "DS"), "is no file: give a backup"),
         (("export", tmp_path / "pipe", tmp_path / "C"), "no regular file"),
         (("train", tmp_path, "--config", tmp_path / "pipe"), "no regular file"),
     ):

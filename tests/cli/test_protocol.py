@@ -139,7 +139,7 @@ def test_virtual_rules_are_tuned_on_another_population():
     layout, gestures = load_layout("plush-15"), load_gestures("plush-18")
     ask, tuned = virtual_rules(1, layout, gestures, people=1)
     assert tuned == "Tuned on 1 other virtual people, of another population."
-    sitting = next(iter(virtual_sittings([1001], 1, 2, layout, gestures=("Tail hit 2",))))
+    sitting = virtual_sittings([1001], 1, 2, layout, gestures=("Tail hit 2",))[0].play()
     begun = [e for e in ask(sitting.frames) if e.kind == "begun" and e.affect == "negative"]
     for trial in sitting.trials:
         assert any(-0.02 <= e.t_s - trial.onset_s < 0.2 for e in begun)

@@ -84,6 +84,20 @@ def test_saving_and_leaving_the_report_out(cli: Cli, dataset: Dataset, tmp_path:
     assert cli("info", dataset.path, "--json").json["licence"] == "CC-BY-4.0"
 
 
+def test_new_codes_in_a_copy_without_metadata(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    key = tmp_path / "key.csv"
+    ran = cli("publish", dataset.path, tmp_path / "OUT", "--without-metadata", "--pseudonyms", "--key", key, "--json")
+    assert {k: ran.json[k] for k in ("subjects", "recordings", "streams")} == {
+        "subjects": 5,
+        "recordings": 30,
+        "streams": 5,
+    }
+    assert cli("info", tmp_path / "OUT", "--json").json["located_in_stream"] == 30
+    assert key.read_text().splitlines()[2].startswith("P1,S")
+    ran = cli("publish", dataset.path, tmp_path / "OUT2", "--without-metadata", "--pseudonyms", "--key", key)
+    assert "never publish it" in ran.out
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -96,6 +110,7 @@ def test_saving_and_leaving_the_report_out(cli: Cli, dataset: Dataset, tmp_path:
         (("publish", "DS", "OUT", "--contact", "Ada"), "write it as"),
         (("publish", "DS", "OUT", *SAID, "--key", "DS/key"), "store it elsewhere"),
         (("publish", "DS", "OUT", *SAID, "--key", "bad.key"), "is not a key"),
+        (("publish", "DS", "OUT", *SAID, "--pseudonyms", "--no-reidentification"), "Pseudonyms need a key"),
         (("publish", "DS", "OUT", *SAID, "--no-reidentification", "--allow-columns", "hand"), "no column 'hand'"),
         (("publish", "DS", "taken", *SAID), "taken.zip' exists without its folder"),
     ],

@@ -53,9 +53,7 @@ def test_labels_between_recordings_are_used_or_ignored(
     labelled = tmp_path / "labelled"
     shutil.copytree(dataset.path, labelled)
     stream = next(s for s in dataset.streams if s.subject == "P4")
-    done = cli(
-        "label", labelled, stream.id, "--from", 0, "--to", stream.seconds, "--as", "rest", "--who", "K", "--json"
-    )
+    done = cli("check", labelled, "--label", stream.id, f"0:{stream.seconds}", "rest", "--who", "K", "--json")
     assert done.json["labelled"] == 1 and done.json["seconds"]["rest"] > 0
     used = cli("stream-eval", labelled, "--model", bundle, "--json").json
     assert used["rest_hours"] > before["rest_hours"] and used["hits"] == before["hits"]
@@ -63,11 +61,11 @@ def test_labels_between_recordings_are_used_or_ignored(
     shown = cli("stream-eval", labelled, "--model", bundle)
     assert "where a recording or a label says what happened" in shown.out
     assert cli("stream-eval", labelled, "--model", bundle, "--labels", "ignore", "--json").json == before
-    assert "--as handling" in cli("label", labelled, stream.id, "--from", 3).err
-    text = cli("label", labelled, "--export", tmp_path / "labels.csv").out
+    assert "--label was given '3'" in cli("check", labelled, "--label", stream.id, 3, "rest").err
+    text = cli("check", labelled, "--save-labels", tmp_path / "labels.csv").out
     assert "labelled stretches; rest" in text
-    assert cli("label", labelled, stream.id, "--undo", "--json").json["stretches"] == []
-    again = cli("label", labelled, "--import", tmp_path / "labels.csv", "--json").json
+    assert cli("check", labelled, "--unlabel", stream.id, ":", "--json").json["stretches"] == []
+    again = cli("check", labelled, "--labels", tmp_path / "labels.csv", "--json").json
     assert again["labelled"] == len(done.json["stretches"]) and again["stretches"] == done.json["stretches"]
 
 

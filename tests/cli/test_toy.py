@@ -53,7 +53,7 @@ def test_live_on_a_scenario_reports_what_is_scored_with_its_truth(tmp_path: Path
     begun = [e for decision in decisions for e in decision.events if e.kind == "begun"]
     scores = stream_eval(
         tmp_path / "played" / "recordings", bundle.save(tmp_path / "m.plush"), events=tmp_path / "events.csv"
-    )
+    ).to_json()
     assert scores["simulated"]
     assert scores["truths"] == 6 == scores["hits"] + scores["deletions"]
     with (tmp_path / "events.csv").open(encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""``plushsense trim`` and ``plushsense stats`` as a user types them."""
+"""``plushsense trim`` and ``plushsense info --durations`` as a user types them."""
 
 from __future__ import annotations
 
@@ -129,16 +129,16 @@ def test_plot(cli: Cli, waves: Path, tmp_path: Path) -> None:
 
 
 def test_stats(cli: Cli, waves: Path) -> None:
-    found = cli("stats", waves, "--channels", "--json").json
+    found = cli("info", waves, "--channels", "--json").json
     assert [d["gesture"] for d in found["durations"]] == ["Fast", "Slow"]
     assert found["durations"][0]["before_s"]["mean"] == pytest.approx(4.0, rel=1e-3)
     assert len(found["channels"]) == 6
-    assert "After trimming" not in cli("stats", waves).out
+    assert "After trimming" not in cli("info", waves, "--durations").out
     cli("trim", waves, "--accept", "*")
-    after = cli("stats", waves, "--json").json["durations"][0]
+    after = cli("info", waves, "--durations", "--json").json["durations"][0]
     assert after["after_s"]["mean"] == pytest.approx(3.5, abs=0.06)
-    assert "After trimming" in cli("stats", waves).out
-    assert cli("stats", waves, "--by", "gender").status == 2
+    assert "After trimming" in cli("info", waves, "--durations").out
+    assert cli("info", waves, "--by", "gender").status == 2
     write_people(waves, [PersonInfo("P1", "child", "f"), PersonInfo("P2", "adult", "f")])
-    by = cli("stats", waves, "--by", "age_group", "--json").json["durations"]
+    by = cli("info", waves, "--by", "age_group", "--json").json["durations"]
     assert [(d["gesture"], d["group"]) for d in by][:3] == [("Fast", "adult"), ("Fast", "child"), ("Fast", "not said")]

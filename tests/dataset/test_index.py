@@ -16,7 +16,7 @@ from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import CsvFormat, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
-from plushsense.dataset.files import current_stamp, is_index_fresh, write_stamp
+from plushsense.dataset.files import IndexStamp
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import change_head, open_dataset
 from plushsense.dataset.marks import Mark, append_marks
@@ -263,7 +263,7 @@ def test_a_change_of_the_head_is_atomic_and_keeps_the_index(folder: Path, monkey
         return replace(head, consent="all agreed", about=replace(head.about, title="Touch"))
 
     assert missing_statements(change_head(folder, entitle)) == ["description", "creators", "licence", "contact"]
-    assert DatasetHead.read(folder).about.title == "Touch" and is_index_fresh(folder)
+    assert DatasetHead.read(folder).about.title == "Touch" and IndexStamp.read(folder) == IndexStamp.of(folder)
     before = (folder / "dataset.toml").read_bytes()
 
     def full(*args: object) -> None:
@@ -301,7 +301,7 @@ def test_a_damaged_index_with_a_right_stamp_is_made_anew(folder: Path, old: str,
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8", errors="surrogateescape")
-    write_stamp(folder, current_stamp(folder))
+    IndexStamp.of(folder).write(folder)
     assert open_dataset(folder).recordings == expected
     assert path.read_text() == text
 
@@ -311,12 +311,12 @@ def test_a_damaged_stamp_is_made_anew(folder: Path, marks: object) -> None:
     expected = open_dataset(folder).recordings
     stamp = json.loads((folder / "index.json").read_text())
     (folder / "index.json").write_text(json.dumps(stamp | {"marks": marks}))
-    assert open_dataset(folder).recordings == expected and is_index_fresh(folder)
+    assert open_dataset(folder).recordings == expected and IndexStamp.read(folder) == IndexStamp.of(folder)
 
 
 def test_an_index_without_a_raw_file_is_made_anew(folder: Path) -> None:
     expected = open_dataset(folder).recordings
     path = folder / "recordings.csv"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
-    write_stamp(folder, current_stamp(folder))
+    IndexStamp.of(folder).write(folder)
     assert open_dataset(folder).recordings == expected

@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.errors import DatasetError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.dataset.importing.importers import import_recordings
@@ -21,7 +22,6 @@ from plushsense.dataset.labelling import (
 )
 from plushsense.dataset.marks import MARKS, LabelledStretch, Mark, append_marks, read_marks
 from plushsense.dataset.privacy.forget import forget
-from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.store import Dataset
 
 ACCEL = load_layout("accel-3")
@@ -47,7 +47,8 @@ def dataset(tmp_path: Path) -> Dataset:
 
 def test_label_list_and_undo(dataset: Dataset) -> None:
     empty = dataset.hash
-    done = decide_labels(dataset.path, P1, start_s=1.0, stop_s=3.5, label="Practice:big_WAVE", who="K", why="seen")
+    wave = (P1, (1.0, 3.5), "Practice:big_WAVE")
+    done = decide_labels(dataset.path, label=[wave], who="K", why="seen")
     assert (done.labelled, done.stretches) == (1, (TimedStretch(P1, 1.0, 3.0, "practice:Big_wave"),))
     (line,) = map(json.loads, (dataset.path / MARKS).read_text().splitlines())
     assert {k: line[k] for k in ("recording", "action", "start", "stop", "label", "who", "why")} == {
@@ -61,11 +62,10 @@ def test_label_list_and_undo(dataset: Dataset) -> None:
     }
     assert done.dataset.stretches == (LabelledStretch(P1, 100, 300, "practice:Big_wave"),), "the recording has its own"
     assert done.dataset.hash != empty
-    assert decide_labels(dataset.path, P1, start_s=1.0, stop_s=3.5, label="practice:Big_wave").labelled == 0
-    decide_labels(dataset.path, P2, start_s=6.0, stop_s=9.99, label="rest")
-    assert [s.stream for s in decide_labels(dataset.path, "P2/*").stretches] == [P2]
-    assert decide_labels(dataset.path, P1, start_s=2.0, undo=True).stretches[0].stop_s == 2.0
-    assert decide_labels(dataset.path, undo=True).undone == 2
+    again = decide_labels(dataset.path, label=[wave, (P2, (6.0, 9.99), "rest")])
+    assert (again.labelled, [s.stream for s in again.stretches]) == (1, [P1, P2])
+    assert decide_labels(dataset.path, unlabel=[(P1, (2.0, None))]).stretches[0].stop_s == 2.0
+    assert decide_labels(dataset.path, unlabel=[("*", (None, None))]).undone == 2
     assert open_dataset(dataset.path).stretches == () and open_dataset(dataset.path).hash == empty
 
 
@@ -88,7 +88,7 @@ def test_labels_are_the_same_after_export_and_import(dataset: Dataset, tmp_path:
     assert path.read_text().splitlines()[:2] == ["stream,start_s,stop_s,label", f"{P1},0.030,0.770,rest"]
     assert read_stretches(labelled, path) == new
     assert decide_labels(dataset.path, file=path).labelled == 0
-    decide_labels(dataset.path, undo=True)
+    decide_labels(dataset.path, unlabel=[("*", (None, None))])
     assert decide_labels(dataset.path, file=path, who="K").dataset.stretches == tuple(new)
 
 
@@ -111,16 +111,24 @@ def test_a_wrong_line_marks_nothing(dataset: Dataset, tmp_path: Path, line: str,
     assert not (dataset.path / MARKS).exists()
 
 
-def test_decisions_that_lack_something_are_refused(dataset: Dataset, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("decision", "error"),
+    [
+        ({"label": [("*", (1.0, 2.0), "rest")]}, r"'\*' names 2 streams"),
+        ({"label": [(P1, (0.0, 1.0), "rest"), (P1, (3.0, 11.0), "rest")]}, "has no 11 s"),
+        ({"label": [(P1, (0.0, 1.0), "rest")], "relabel": [("P1/*", "Wive")]}, "no gesture 'Wive'"),
+        ({"label": [(P1, (0.0, 1.0), "rest")], "unlabel": [("P9", (None, None))]}, "no stream 'P9'"),
+        ({"label": [(P1, (0.0, 1.0), "rest")], "relabel": [("P9/*", "Big_wave")]}, "no recording 'P9"),
+    ],
+)
+def test_a_wrong_decision_marks_nothing(dataset: Dataset, decision: dict[str, Any], error: str) -> None:
+    with pytest.raises(DatasetError, match=error):
+        decide_labels(dataset.path, **decision)
+    assert not (dataset.path / MARKS).exists()
+
+
+def test_files_and_rows_that_do_not_fit_are_refused(dataset: Dataset, tmp_path: Path) -> None:
     (tmp_path / "odd.csv").write_text("stream,label\n")
-    for words, said in (
-        ({"label": "rest"}, "needs its two times"),
-        ({"start_s": 1.0, "stop_s": 2.0}, "needs its two times and a label"),
-        ({"label": "rest", "start_s": 1.0, "stop_s": 2.0}, "names 2: give an id"),
-        ({"label": "rest", "undo": True}, "one of these at a time"),
-    ):
-        with pytest.raises(ConfigError, match=said):
-            decide_labels(dataset.path, **words)  # type: ignore[arg-type]
     with pytest.raises(DatasetError, match="lacks start_s, stop_s"):
         decide_labels(dataset.path, file=tmp_path / "odd.csv")
     with pytest.raises(DatasetError, match="There is no file"):
@@ -129,14 +137,9 @@ def test_decisions_that_lack_something_are_refused(dataset: Dataset, tmp_path: P
         label_stretches(dataset, [LabelledStretch(P1, 5, 1001, "rest")])
 
 
-def test_labels_of_a_removed_person_go_and_of_a_pseudonym_stay(dataset: Dataset, tmp_path: Path) -> None:
+def test_labels_of_a_removed_person_go(dataset: Dataset) -> None:
     both = [LabelledStretch(p, 0, 50, "practice:Big_wave") for p in (P1, P2)]
     label_stretches(dataset, [*both, LabelledStretch(P2, 20, 30, "rest")], "K")
-    hidden = pseudonymise(dataset.path, tmp_path / "OUT", key=tmp_path / "secret" / "key.csv").dataset
-    assert sorted((s.start, s.stop, s.label) for s in hidden.stretches) == sorted(
-        (s.start, s.stop, s.label) for s in open_dataset(dataset.path).stretches
-    )
-    assert not any(s.stream.startswith("P") for s in hidden.stretches)
     forget(dataset.path, "P1")
     assert set(read_marks(dataset.path)) == {P2}
     assert {s.stream for s in open_dataset(dataset.path).stretches} == {P2}

@@ -13,8 +13,7 @@ from plushsense.cli.main import main
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.dataset.index import change_head, open_dataset, rebuild_index
-from plushsense.dataset.labelling import relabel
-from plushsense.dataset.privacy.pseudonymise import pseudonymise
+from plushsense.dataset.labelling import relabel_recordings
 from plushsense.dataset.publishing.package import complete_head, publish
 from plushsense.dataset.quality.checking import check
 from plushsense.dataset.store import Dataset
@@ -38,7 +37,7 @@ def test_the_mark_is_what_counts(dataset: Dataset) -> None:
     wave = next(r for r in dataset.recordings if r.gesture == "Wave")
     rest = next(r for r in dataset.recordings if r.gesture == "Rest")
     assert rest.subject == "none"
-    assert relabel(dataset, [wave.id, rest.id], "rest", "K", "seen on video") == (wave.id,)
+    assert relabel_recordings(dataset, [wave.id, rest.id], "rest", "K", "seen on video") == (wave.id,)
     # Of the index that only the marks changed, and of one that is built again.
     for now in (open_dataset(dataset.path), rebuild_index(dataset.path).dataset):
         found = next(r for r in now.recordings if r.id == wave.id)
@@ -47,10 +46,10 @@ def test_the_mark_is_what_counts(dataset: Dataset) -> None:
     windows = cut_windows(open_dataset(dataset.path))
     assert sum(windows.labels[windows.y[windows.recording == i][0]] == "Rest" for i in set(windows.recording)) == 3
     assert {f.gesture for f in check(open_dataset(dataset.path)).findings if f.recording == wave.id} <= {"Rest"}
-    assert relabel(open_dataset(dataset.path), [rest.id], "Wave", "K") == (rest.id,)
+    assert relabel_recordings(open_dataset(dataset.path), [rest.id], "Wave", "K") == (rest.id,)
     again = next(r for r in open_dataset(dataset.path).recordings if r.id == rest.id)
     assert (again.gesture, again.subject) == ("Wave", rest.id.split("/")[0])
-    assert relabel(dataset, [wave.id, rest.id], "", "K") == (wave.id, rest.id)
+    assert relabel_recordings(dataset, [wave.id, rest.id], "", "K") == (wave.id, rest.id)
     assert open_dataset(dataset.path).hash == before and raw_hash(dataset.path) == raw
     assert [(m["action"], m.get("gesture", "")) for m in marks(dataset.path)] == [
         ("relabel", "Rest"),
@@ -63,10 +62,10 @@ def test_the_mark_is_what_counts(dataset: Dataset) -> None:
 def test_what_cannot_be_is_refused_and_nothing_written(dataset: Dataset) -> None:
     wave = next(r for r in dataset.recordings if r.gesture == "Wave")
     with pytest.raises(DatasetError, match="has no gesture 'Wive'.*Did you mean 'Wave'") as refused:
-        relabel(dataset, [wave.id], "Wive", "K")
+        relabel_recordings(dataset, [wave.id], "Wive", "K")
     assert refused.value.reason == "unknown_gesture" and marks(dataset.path) == []
     with pytest.raises(DatasetError, match="no recording"):
-        relabel(dataset, [wave.id, "P9/none"], "Rest", "K")
+        relabel_recordings(dataset, [wave.id, "P9/none"], "Rest", "K")
     assert marks(dataset.path) == []
 
 
@@ -83,18 +82,16 @@ def test_an_index_of_an_older_version_is_built_again(dataset: Dataset) -> None:
     assert [r.recorded for r in open_dataset(dataset.path).recordings] == [r.gesture for r in dataset.recordings]
 
 
-def test_copies_and_packages_have_the_new_gesture(
+def test_packages_have_the_new_gesture(
     dataset: Dataset, tmp_path: Path, publish_tools: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wave = next(r for r in dataset.recordings if r.gesture == "Wave")
-    assert main(["label", str(dataset.path), "--recording", wave.id, "--as", "Rest", "--who", "K", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"relabelled": [wave.id]}
+    assert main(["check", str(dataset.path), "--relabel", wave.id, "Rest", "--who", "K", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["relabelled"] == [wave.id]
     dataset = open_dataset(dataset.path)
     done = publish(dataset, tmp_path / "out", complete_head(dataset.head, dataset.path, *STATEMENTS))
     assert done.checked.problems == [] and any("Relabelled: 1 recording;" in note for note in done.description.notes)
     with (tmp_path / "out" / "recordings.csv").open(encoding="utf-8", newline="") as file:
         assert sum(row["gesture"] == "Rest" for row in csv.DictReader(file)) == 3
-    pseudonymise(dataset.path, tmp_path / "copy", key=tmp_path / "key.csv", words=[])
-    assert sorted(r.gesture for r in open_dataset(tmp_path / "copy").recordings) == ["Rest"] * 3 + ["Wave"] * 5
-    assert main(["label", str(dataset.path), "--recording", wave.id, "--undo", "--who", "K"]) == 0
+    assert main(["check", str(dataset.path), "--relabel", wave.id, "", "--who", "K"]) == 0
     assert next(r for r in open_dataset(dataset.path).recordings if r.id == wave.id).gesture == "Wave"

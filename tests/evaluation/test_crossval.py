@@ -37,7 +37,7 @@ def trainings(folder: Path) -> dict[str, int]:
 def test_every_figure_of_a_subject_wise_evaluation(tmp_path: Path) -> None:
     windows, loops = study(), study(context="loop")
     found = evaluate(loops, windows, parse_split("leave-one-subject-out"), Oracle(str(tmp_path), ("P01",)), seed=3)
-    table = found.to_dict()
+    table = found.to_json()
     assert table.keys() == KEYS
     json.dumps(table, allow_nan=False)
     assert (table["split"], table["context"], table["train_context"]) == ("leave-one-subject-out", "stream", "loop")
@@ -74,17 +74,17 @@ def test_every_figure_of_a_subject_wise_evaluation(tmp_path: Path) -> None:
 
 def test_a_leak_shows_and_is_marked() -> None:
     windows = study(repetitions=4, windows=4)
-    by_window = evaluate(windows, windows, parse_split("windows:4"), Memory()).to_dict()
+    by_window = evaluate(windows, windows, parse_split("windows:4"), Memory()).to_json()
     assert by_window["leaky"] is True and by_window["accuracy"]["mean"] > 0.9
     assert by_window["over"] == "folds" and len(by_window["folds"]) == 4
     for text in ("by-recording:4", "by-subject:3"):
-        assert evaluate(windows, windows, parse_split(text), Memory()).to_dict()["accuracy"]["mean"] == 0.0
+        assert evaluate(windows, windows, parse_split(text), Memory()).to_json()["accuracy"]["mean"] == 0.0
 
 
 def test_a_holdout_scores_what_it_tested_only() -> None:
     windows = study(repetitions=5, windows=4)
     found = evaluate(windows, windows, parse_split("windows:holdout"), Memory())
-    table = found.to_dict()
+    table = found.to_json()
     assert len(found.predictions) == table["folds"][0]["test_windows"] == round(0.15 * len(windows))
     assert table["accuracy"]["sd"] is None and table["accuracy"]["ci95"] is None
     json.dumps(table, allow_nan=False)
@@ -102,7 +102,7 @@ def test_progress_and_the_same_result_from_several_processes(tmp_path: Path, wor
         (f"fold {f}", e) for f in (1, 2, 3) for e in (1, 2, 3)
     ]
     assert all(s.total == 3 and s.epochs in (0, 3) for s in said)
-    assert found.to_dict()["accuracy"]["mean"] == 1.0
+    assert found.to_json()["accuracy"]["mean"] == 1.0
     assert sum(trainings(tmp_path).values()) == 3
 
 
@@ -113,7 +113,7 @@ def test_finished_folds_are_not_trained_again_and_changed_ones_are(tmp_path: Pat
     said: list[JobProgress] = []
     again = evaluate(windows, windows, parse_split("by-subject:3"), oracle, progress=said.append, **ask)
     assert sum(trainings(tmp_path).values()) == 3 and said[-1].resumed == 3
-    assert again.to_dict() == first.to_dict()
+    assert again.to_json() == first.to_json()
     next(journal.folder.iterdir()).write_bytes(b"damaged")
     evaluate(windows, windows, parse_split("by-subject:3"), oracle, **ask)
     assert sum(trainings(tmp_path).values()) == 4
@@ -129,7 +129,7 @@ def test_the_figures_come_from_the_kept_predictions(tmp_path: Path) -> None:
     windows = study()
     found = evaluate(windows, windows, parse_split("by-subject:3"), Oracle(str(tmp_path), ("P02",)))
     path = found.write_predictions(tmp_path / "deep" / "predictions.parquet")
-    assert found.to_dict()["predictions"] == str(path)
+    assert found.to_json()["predictions"] == str(path)
     table = polars.read_parquet(path)
     assert table.columns == [
         "subject", "recording", "window", "context", "fold", "truth", "predicted", *(f"p_{k}" for k in LABELS),

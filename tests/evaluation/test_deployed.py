@@ -18,7 +18,7 @@ from support.fakes import Deploying, Oracle, study
 def test_what_deploying_costs_each_person(tmp_path: Path) -> None:
     found = evaluate(
         study(), study(), parse_split("leave-one-subject-out"), Deploying(str(tmp_path), ("P01",))
-    ).to_dict()
+    ).to_json()
     assert found["accuracy"]["mean"] == 1.0, "the float figures stay what they are"
     int8 = found["int8"]
     json.dumps(int8, allow_nan=False)
@@ -39,7 +39,7 @@ def test_what_deploying_costs_each_person(tmp_path: Path) -> None:
 
 
 def test_folds_where_people_are_not_kept_apart(tmp_path: Path) -> None:
-    found = evaluate(study(), study(), parse_split("by-recording:3"), Deploying(str(tmp_path), ("P01",))).to_dict()[
+    found = evaluate(study(), study(), parse_split("by-recording:3"), Deploying(str(tmp_path), ("P01",))).to_json()[
         "int8"
     ]
     assert found["over"] == "folds" and len(found["rows"]) == 3
@@ -50,13 +50,13 @@ def test_folds_where_people_are_not_kept_apart(tmp_path: Path) -> None:
 def test_it_comes_back_from_the_journal_and_is_not_made_up_without(tmp_path: Path) -> None:
     journal, work = Journal(tmp_path / "folds"), Deploying(str(tmp_path), ("P02",))
     first, second = (
-        evaluate(study(), study(), parse_split("by-subject:3"), work, journal=journal, key={"int8": 1}).to_dict()
+        evaluate(study(), study(), parse_split("by-subject:3"), work, journal=journal, key={"int8": 1}).to_json()
         for _ in range(2)
     )
     assert first == second and "int8" in first
     trained = sum(len(path.read_text()) for path in tmp_path.glob("trained-*"))
     assert trained == 2 * 3, "a second run trains nothing"
-    assert "int8" not in evaluate(study(), study(), parse_split("by-subject:3"), Oracle(str(tmp_path))).to_dict()
+    assert "int8" not in evaluate(study(), study(), parse_split("by-subject:3"), Oracle(str(tmp_path))).to_json()
 
 
 def too_few(train, validation, test, progress, /):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.experiments.adaptation import HeldOutPerson, Predictors, score_adaptation
+from plushsense.experiments.adaptation import AdaptationScores, ChoiceSpec, HeldOutPerson, Predictors, try_adapting
 from plushsense.windows.cut import WindowSet
 from support.fakes import plain_units
 
@@ -71,17 +71,25 @@ class Recorder:
         return {"float": self.reader} if self.accepted else None
 
 
+def score_adaptation(
+    windows: WindowSet, people: list[HeldOutPerson], times: dict[str, int], random: int = 0
+) -> AdaptationScores:
+    choice = ChoiceSpec(random=random)
+    return AdaptationScores.over("stream", choice, [try_adapting(windows, p, times, choice) for p in people])
+
+
 def test_all_choices_and_what_is_gained() -> None:
     windows, times = made()
     adapt = Recorder()
     found = score_adaptation(windows, [HeldOutPerson(p, {"float": always_hold}, adapt) for p in ("A", "B")], times)
-    assert found["choices"] == 12 and len(adapt.given) == 12 and found["refused"] == 0.0
+    assert found.choices == 12 and len(adapt.given) == 12 and found.refused == 0.0
     assert all(len(own) == 6 and len(set(own.subject)) == 1 for own in adapt.given)
-    one = found["engines"]["float"]
-    assert one["accuracy"]["before"]["mean"] == pytest.approx(1 / 3) and one["accuracy"]["after"]["mean"] == 1.0
-    assert one["accuracy"]["gain"]["mean"] == pytest.approx(2 / 3) and one["macro_f1"]["after"]["mean"] == 1.0
-    assert one["right"] == {"mean": 4.0, "worst_mean": 4.0, "worst": 4, "worse_people": 0, "worse_choices": 0.0}
-    assert [row["subject"] for row in one["people"]] == ["A", "B"] and one["people"][0]["recordings"] == 6.0
+    one = found.engines["float"]
+    means = {score: {when: spread["mean"] for when, spread in at.items()} for score, at in one.scores.items()}
+    assert means["accuracy"] == pytest.approx({"before": 1 / 3, "after": 1.0, "gain": 2 / 3, "first": 2 / 3})
+    assert means["macro_f1"]["after"] == 1.0
+    assert one.right == {"mean": 4.0, "worst_mean": 4.0, "worst": 4, "worse_people": 0, "worse_choices": 0.0}
+    assert [row.subject for row in one.people] == ["A", "B"] and one.people[0].recordings == 6.0
 
 
 def test_the_first_choice_is_the_first_recordings_by_the_clock() -> None:
@@ -98,21 +106,21 @@ def test_a_loss_is_counted_person_by_person_and_choice_by_choice() -> None:
         HeldOutPerson("A", {"float": truth}, Recorder(always_hold)),
         HeldOutPerson("B", {"float": always_hold}, Recorder(truth)),
     ]
-    right = score_adaptation(windows, people, times)["engines"]["float"]["right"]
+    right = score_adaptation(windows, people, times).engines["float"].right
     assert right == {"mean": 0.0, "worst_mean": -4.0, "worst": -4, "worse_people": 1, "worse_choices": 0.5}
 
 
 def test_what_is_refused_changes_nothing() -> None:
     windows, times = made()
     found = score_adaptation(windows, [HeldOutPerson("A", {"float": truth}, Recorder(always_hold, False))], times)
-    assert found["refused"] == 1.0 and found["engines"]["float"]["right"]["mean"] == 0.0
+    assert found.refused == 1.0 and found.engines["float"].right["mean"] == 0.0
 
 
 def test_random_choices_differ_from_gesture_to_gesture() -> None:
     windows, times = made()
     adapt = Recorder()
     found = score_adaptation(windows, [HeldOutPerson("A", {"float": always_hold}, adapt)], times, random=20)
-    assert found["choices"] == 26
+    assert found.choices == 26
     mixed = [{windows.recording_ids[r][-1] for r in own.recording} for own in adapt.given[6:]]
     assert any(len(numbers) > 2 for numbers in mixed) and all(len(own) == 6 for own in adapt.given)
 
@@ -139,8 +147,8 @@ def test_engines_are_compared() -> None:
         return {"float": truth, "int8": truth}
 
     found = score_adaptation(windows, [HeldOutPerson("A", {"float": truth, "int8": always_hold}, adapt)], times)
-    assert found["agreement"] == {"before": pytest.approx(1 / 3), "after": 1.0}
-    assert set(found["engines"]) == {"float", "int8"}
+    assert found.agreement == {"before": pytest.approx(1 / 3), "after": 1.0}
+    assert set(found.engines) == {"float", "int8"}
 
 
 def test_too_few_recordings_to_test() -> None:

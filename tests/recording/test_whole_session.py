@@ -69,8 +69,8 @@ def test_51_recordings_that_import_again(tmp_path: Path) -> None:
     assert {label: made.count(label) for label in GESTURES} == dict.fromkeys(GESTURES, 3)
     _hand_follows_prompt(folder, toy)
     summary = import_recordings(out, tmp_path / "ds")
-    assert (summary.recordings, summary.streams, summary.rejected, summary.left_out) == (51, 1, [], [])
-    assert (summary.warnings, summary.dataset.head.simulated) == ([], True)
+    assert (summary.recordings, summary.streams, summary.rejected, summary.left_out) == (51, 1, (), ())
+    assert (summary.warnings, summary.dataset.head.simulated) == ((), True)
     assert {(r.subject, r.session, r.excluded) for r in summary.dataset.recordings} == {("S01", "1", False)}
     assert read_people(tmp_path / "ds") == {"S01": PersonInfo("S01", "child")}
     assert [f for f in check_dataset(summary.dataset).findings if f.severity != "info"] == []

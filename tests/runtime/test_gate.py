@@ -18,10 +18,8 @@ from plushsense.runtime.gate import (
     Rule,
     Signal,
     Term,
-    firings,
-    follow,
-    raw_signals,
 )
+from plushsense.runtime.replay import firings, follow, raw_signals
 from plushsense.tuning.gate import signal_sizes
 
 BLOW = Rule((Term(0, 32, times=2),), affect=3, gesture=255, within=3, deaf=5)

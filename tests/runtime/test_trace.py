@@ -17,7 +17,8 @@ from plushsense.runtime.events import BEGUN, CNN, ENDED, GATE, NAMED, NO_GESTURE
 from plushsense.runtime.fixed import integer_logits
 from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
-from plushsense.runtime.trace import ReportedEvent, TraceReplayer, replay, reported_events, trace_of
+from plushsense.runtime.replay import TraceReplayer
+from plushsense.runtime.trace import ReportedEvent, replay, reported_events, trace_of
 from support.troubles import SPECS, STREAMS, TROUBLES, calibrate, events_of, lived, make_bundle, reader_of, same, stream
 
 ENGINES = ("float", "int8")

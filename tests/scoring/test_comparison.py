@@ -54,7 +54,7 @@ def test_pairs_and_cliques() -> None:
     scores = np.stack([base + 0.1, base + 0.1 + rng.normal(0, 0.02, 20), base], axis=1)
     pairs = compare_pairs(("A", "B", "C"), scores)
     assert [(row.first, row.second) for row in pairs] == [("A", "B"), ("A", "C"), ("B", "C")]
-    assert pairs[1].difference["mean"] == pytest.approx(0.1) and pairs[1].better == 20
+    assert pairs[1].difference.mean == pytest.approx(0.1) and pairs[1].better == 20
     assert pairs[1].effect == 1.0 and pairs[1].p_holm < 0.001
     assert pairs[0].p_holm > 0.05
     assert cliques(("A", "B", "C"), pairs) == [("A", "B")]

@@ -277,23 +277,15 @@ def test_a_worker_that_is_asked_nonsense_refuses(line: str) -> None:
     worker.stdout.close()
 
 
-def test_names_that_may_not_be_left_anywhere_are_not_left_in_the_work_folder(workspace: Workspace, jobs: Jobs) -> None:
-    place = str(workspace.folder / "datasets" / "copy")
-    given = {
-        "dataset": str(workspace.folder),
-        "place": place,
-        "key": str(workspace.folder / "key"),
-        "words": ["Annabelle"],
-    }
-    job = ended(jobs.start("pseudonymise", given, "Copy"))
-    assert job.state == REFUSED and job.spec["words"] == ["Annabelle"]
+def test_a_person_to_remove_is_not_stored_in_the_work_folder(workspace: Workspace, jobs: Jobs) -> None:
+    job = ended(jobs.start("forget", {"dataset": str(workspace.folder), "person": "Annabelle"}, "Remove"))
+    assert job.state == REFUSED and job.spec["person"] == "Annabelle"
     assert not [p for p in workspace.folder.rglob("*") if p.is_file() and "Annabelle" in p.read_text(encoding="utf-8")]
-    # A studio that was started again has them no more: doing without would leave the names in.
-    later = Jobs(workspace)
-    again = ended(later.resume(job.id))
+    # A studio that was started again does not know the person any more.
+    again = ended(Jobs(workspace).resume(job.id))
     assert (again.state, again.message) == (
         REFUSED,
-        "The words to remove are not stored: enter them again on the publish page.",
+        "The person's code is not stored: choose the person in the menu of the data set again.",
     )
 
 

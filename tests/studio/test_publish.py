@@ -6,14 +6,12 @@ import io
 import json
 import os
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.dataset.privacy.pseudonyms import is_drawn
 from plushsense.dataset.publishing.checking import VALIDATORS
 from plushsense.dataset.store import PEOPLE
 from plushsense.studio import tasks
@@ -40,29 +38,6 @@ def run_task(task: Any, **spec: Any) -> tuple[dict[str, Any], list[dict[str, Any
     return result, [json.loads(line) for line in out.getvalue().splitlines()]
 
 
-def test_pseudonyms_then_the_advice_is_gone(few: Path) -> None:
-    workspace = Workspace(few)
-    found = DatasetFacts.of(workspace.datasets()[0])
-    assert found.dataset is not None and found.problem is None
-    assert (len(found.dataset.subjects), len(found.dataset.recordings), found.dataset.head.simulated) == (3, 9, True)
-    assert found.own_codes == ("P01", "P02", "P03") and found.own_dates
-    place, key = workspace.new("datasets", "shared"), workspace.folder / "keys" / "people.csv"
-    spec = {"dataset": str(found.path), "place": str(place), "key": str(key), "words": []}
-    result, reports = run_task(tasks.run_pseudonymise, **spec)
-    renamed = DatasetFacts.of(place)
-    assert renamed.dataset is not None
-    assert (renamed.own_codes, renamed.own_dates, len(renamed.dataset.recordings)) == ((), False, 9)
-    assert reports[-1]["progress"] == {"stage": "rewriting", "done": 9, "total": 9}
-    assert result["key"] == str(key)
-    if sys.platform != "win32":
-        assert key.stat().st_mode & 0o77 == 0
-
-
-def test_codes_that_were_drawn() -> None:
-    assert is_drawn("S7K2Q")
-    assert not any(is_drawn(code) for code in ("P01", "Anna", "S7K2", "S7K2Q1", "s7k2q", "S0K2Q"))
-
-
 def test_columns_and_a_broken_data_set(few: Path) -> None:
     folder = few / "datasets" / "virtual"
     (folder / PEOPLE).write_text("subject,age_group,gender,consent,handedness\nP01,10-12,f,A1,left\n", "utf-8")
@@ -73,6 +48,7 @@ def test_columns_and_a_broken_data_set(few: Path) -> None:
 
 def test_a_package_by_the_tasks(few: Path, publish_tools: None, monkeypatch: pytest.MonkeyPatch) -> None:
     workspace = Workspace(few)
+    assert DatasetFacts.of(workspace.datasets()[0]).own_codes == ("P01", "P02", "P03")
     place, key = workspace.new(PACKAGES, "one"), workspace.folder / "keys" / "virtual.key"
     spec = {"dataset": str(workspace.datasets()[0]), "place": str(place), "key": str(key), "reidentification": False}
     # Where the statements cannot be kept, the package stands all the same, and says so.

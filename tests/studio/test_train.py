@@ -305,9 +305,6 @@ filters = [[4, 4], [8, 8]]
 epochs = [1]
 batches = [64]
 split = "windows:holdout"
-
-[search]
-rungs = [1, 2]
 """
 
 
@@ -318,8 +315,8 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     # As many threads as there are cores: their networks are trained in the process of the job, not in processes of
     # their own, which would each load PyTorch again for each rung. The tests' own os.cpu_count() is 1.
     grid = _GRID.replace("[grid]", f"[grid]\nthreads = {len(os.sched_getaffinity(0))}")
-    for name in ("tiny", "little"):
-        (home / f"{name}.toml").write_text(grid, encoding="utf-8")
+    (home / "tiny.toml").write_text(grid, encoding="utf-8")
+    (home / "little.toml").write_text(grid.replace("epochs = [1]", "epochs = [1, 2]"), encoding="utf-8")
     (home / "wrong.toml").write_text('[grid]\nepochs = [0]\narchitectures = ["14x"]\n', encoding="utf-8")
     browser = look()
     page = browser.open(f"{studio(home=home).url}/train")
@@ -359,7 +356,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     assert axe(page) == []
     shots(page, "train-sweep")
 
-    # A search among them, within a limit.
+    # The best of them by halving, within a limit.
     kind(page, "Find a small network")
     choose(page, "grid", "little.toml")
     choose(page, "split", "15 % of the windows")
@@ -369,8 +366,8 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     marked(page, "start").click()
     found_job = page.locator('[data-test="job"][data-state="done"]', has_text="Find a small network")
     found_job.wait_for(timeout=LONG_MS)
-    (found,) = (home / "datasets" / "virtual" / "evaluations").glob("search-little-*")
-    best = json.loads((found / "search.json").read_text(encoding="utf-8"))["winner"]
+    (found,) = (home / "datasets" / "virtual" / "evaluations").glob("sweep-little-*")
+    best = json.loads((found / "sweep.json").read_text(encoding="utf-8"))["halving"]["winner"]
     assert best["parameters"] <= 1400
     assert f"macro-F1 {best['macro_f1']:.3f}" in found_job.locator('[data-test="result"]').inner_text()
     assert browser.complaints == []

@@ -62,6 +62,13 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
     assert found.spec["out"] == str(home / "bundles" / "new one.plush")
 
 
+def test_find_a_small_network_is_a_sweep_with_halving(home: Path) -> None:
+    found = made(Workspace(home), kind="search", max_parameters=1400, share="0,5", seeds=2)
+    assert found.command.endswith("--grid people --seeds 2 --halving --max-parameters 1400 --share 0.5")
+    assert " sweep " in found.command and found.spec["grid"] == "people"
+    assert found.spec["changes"] == {"seeds": [0, 1], "max_parameters": 1400, "share": 0.5, "halving": True}
+
+
 @pytest.mark.parametrize(
     ("form", "said"),
     [

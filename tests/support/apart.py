@@ -38,7 +38,7 @@ GROUPS = tuple(
         "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py"
         " experiments/streams/test_predictions.py",
         "experiments/sweep/test_cluster.py experiments/sweep/test_mlflow.py experiments/sweep/test_report.py"
-        " experiments/sweep/test_report_files.py experiments/sweep/test_run.py",
+        " experiments/sweep/test_halving_run.py experiments/sweep/test_run.py",
         "jobs/test_cluster.py",
         "studio/test_hostile_results.py studio/test_words.py",
         "studio/test_train_scores.py",
@@ -54,10 +54,11 @@ GROUPS = tuple(
         # Trainings in the process of the tests, 100 MB each time one is under way and afterwards.
         "cli/test_adapt.py cli/test_extending.py cli/test_live.py cli/test_main.py cli/test_paper_page.py"
         " cli/test_protocol.py cli/test_stream_eval.py cli/test_trim.py"
-        " experiments/analysis/test_comparison.py experiments/analysis/test_merging.py experiments/search/test_run.py"
+        " experiments/analysis/test_comparison.py experiments/analysis/test_merging.py"
         " experiments/streams/test_training.py faults/test_interrupted.py"
-        " models/test_net.py training/fast/test_net.py training/test_fit.py trials/test_budget.py"
-        " trials/test_estimate.py workflow/test_api.py workflow/test_calibration.py workflow/test_fitting_decisions.py"
+        " models/test_net.py training/fast/test_net.py training/test_fit.py"
+        " workflow/test_api.py workflow/test_budget.py workflow/test_estimate.py workflow/test_calibration.py"
+        " workflow/test_fitting_decisions.py"
         " workflow/test_forget_beside.py"
         " workflow/test_reporting.py workflow/test_resuming.py",
     )

@@ -51,13 +51,13 @@ EXHAUSTIVE = {
     "deploy/test_profile.py::test_what_is_counted_is_what_stands_in_the_folder",
     "experiments/baselines/test_models.py::test_every_baseline_learns_gives_probabilities_and_repeats_itself[extra-trees]",
     "experiments/analysis/test_merging.py::test_a_merged_set_is_trained_scored_and_exported",
-    "experiments/search/test_run.py::test_killed_in_every_rung_and_gone_on_with",
     "experiments/sweep/test_cluster.py::test_a_cluster_that_is_not_there[127.0.0.1:1]",
     "experiments/sweep/test_cluster.py::test_a_cluster_that_is_not_there[nowhere.invalid:6379]",
     "experiments/sweep/test_cluster.py::test_a_node_lost_in_a_sweep_changes_nothing",
     "experiments/sweep/test_report.py::test_a_fair_split_of_real_data_bears_no_mark",
-    "experiments/sweep/test_report_files.py::test_a_sweeps_folder_makes_its_page",
-    "experiments/sweep/test_run.py::test_killed_three_times_and_gone_on_with",
+    "experiments/sweep/test_report.py::test_a_sweeps_folder_makes_its_page",
+    "experiments/sweep/test_run.py::test_killed_and_gone_on_with[False]",
+    "experiments/sweep/test_run.py::test_killed_and_gone_on_with[True]",
     "jobs/test_cluster.py::test_what_a_job_raises_comes_through",
     "recording/test_whole_session.py::test_killed_three_times",
     "reports/test_quality.py::test_pictures_are_bounded_and_the_page_says_so",
@@ -136,7 +136,7 @@ EXHAUSTIVE = {
     ),
     *(
         f"workflow/test_forget_beside.py::test_who_is_forgotten_meanwhile_does_not_come_back[{command}-early]"
-        for command in ("baselines", "evaluate_in_processes", "search", "streams", "sweep")
+        for command in ("baselines", "evaluate_in_processes", "halving", "streams", "sweep")
     ),
     *(
         f"studio/test_pictures_of_pages.py::test_a_page_reads_well[{page}-{view}]"
@@ -156,7 +156,6 @@ EXHAUSTIVE = {
             "firmware",
             "importing",
             "live",
-            "network-search",
             "pairing",
             "people",
             "personal",

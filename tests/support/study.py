@@ -26,7 +26,7 @@ def metric(values: Any) -> dict[str, Any]:
 def evaluation(
     split: str, context: str, train_context: str, skill: float, *, people: int = 25, seed: int = 0
 ) -> dict[str, Any]:
-    """One evaluation as ``Evaluation.to_dict()`` gives it."""
+    """One evaluation as ``EvaluationResult.to_json()`` gives it."""
     draw = np.random.default_rng(seed)
     gestures = load_gestures("plush-18")
     labels = [g.label for g in gestures.gestures]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,15 +12,16 @@ from plushsense.core.recorder_csv import Frames, format_header, format_rows, rec
 from plushsense.dataset.about import About, Contact, Creator
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.dataset.publishing.contents import PublishOptions
-from plushsense.dataset.publishing.package import PublishResult, complete_head, publish
+from plushsense.dataset.publishing.contents import ContentsSpec
+from plushsense.dataset.publishing.keys import PublicationKey
+from plushsense.dataset.publishing.package import PackageSpec, PublishResult, complete_head, publish
 from plushsense.dataset.store import Dataset, DatasetHead, PersonInfo, write_people
 
 ACCEL = load_layout("accel-3")
 # 14 November 2023, 22:13:20 UTC.
 BEGAN_MS = 1_700_000_000_000
 DAY_MS = 86_400_000
-KEY = b"a key for tests, 32 bytes long.."
+KEY = PublicationKey(b"a key for tests, 32 bytes long..")
 SECRETS = ("hthompson", "Anna", "CONSENT-77", "Oakfield", "2023-11", "AA:BB:CC", "school", "too loud")
 GESTURES = GestureSet(
     "test", (Gesture("Ear_tug", "positive"), Gesture("Pat", "neutral"), Gesture("Lie", nobody=True), Gesture("Odd"))
@@ -97,6 +97,6 @@ def make(folder: Path, *, simulated: bool = False) -> Dataset:
     return open_dataset(folder)
 
 
-def made_of(dataset: Dataset, out: Path, options: PublishOptions | None = None, **more: Any) -> PublishResult:
+def made_of(dataset: Dataset, out: Path, contents: ContentsSpec | None = None) -> PublishResult:
     head = complete_head(dataset.head, dataset.path)
-    return publish(dataset, out, head, options=options or PublishOptions(key=KEY), published="2026-01-31", **more)
+    return publish(dataset, out, head, PackageSpec(contents or ContentsSpec(key=KEY), published="2026-01-31"))

@@ -197,7 +197,7 @@ def test_what_cannot_be_trained_is_said(made: Make) -> None:
 
 
 def test_a_loss_that_is_no_number_ends_the_training(made: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("plushsense.training.fit._train", lambda *_: (float("nan"), 0.1))
+    monkeypatch.setattr("plushsense.training.fit._Training.train", lambda *_: (float("nan"), 0.1))
     with pytest.raises(TrainingError, match="train loss is no longer a number in epoch 1.*such as 0.0003"):
         fit(made(20), None, arch(), SPEC)
 

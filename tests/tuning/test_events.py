@@ -9,7 +9,8 @@ from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.models.arch import Arch
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
-from plushsense.runtime.trace import Part, Trace, TraceReplayer
+from plushsense.runtime.replay import TraceReplayer
+from plushsense.runtime.trace import Part, Trace
 from plushsense.scoring.events import ErrorCosts
 from plushsense.tuning.events import (
     OTHER,

@@ -101,8 +101,7 @@ def virtual(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def test_tuned_by_hand_they_do_what_the_paper_saw(virtual: Dataset) -> None:
     """A simulation: blows at once, most broad strokes, hardly any fine scratch, nothing to holding."""
-    settings, report = fit_rule_baseline(virtual, virtual.gestures, virtual.subjects)
-    assert report["people"] == 6 and max(report["answered_as_a_caress"].values()) <= 0.02
+    settings = fit_rule_baseline(virtual, virtual.gestures, virtual.subjects)
     answered: dict[str, list[bool]] = {"stroke": [], "scratch": [], "blow": [], "hold": []}
     kinds = {
         "Back stroke 1": "stroke",
@@ -151,7 +150,3 @@ def test_a_toy_without_electrodes_has_blows_only() -> None:
     assert [a for a, _ in begun(rule_baseline_events(frames, layout, RuleBaselineSettings(shock=5_000)))] == [
         "negative"
     ]
-
-
-def test_the_file_of_a_plan() -> None:
-    assert RuleBaselineSettings(**SETTINGS.to_dict()) == SETTINGS

@@ -69,11 +69,11 @@ def test_fine_tuning_for_8_bits_keeps_the_ranges_it_was_made_for(dataset: Datase
     told: list[str] = []
     assert calibrated_on(tuned.bundle, dataset, told.append) is tuned.bundle and "is kept" in told[0]
     for one in (plain, tuned):
-        found = one.scores["int8"]
-        assert 0.5 < found["agreement"] <= 1 and 0 <= found["macro_f1"] <= 1
-    poor = plain.scores["int8"]["agreement"] < 0.95
+        found = one.scores.int8
+        assert found is not None and 0.5 < found.agreement <= 1 and 0 <= found.macro_f1 <= 1
+    poor = plain.scores.int8.agreement < 0.95
     assert any("--quantize-aware" in line for line in said) == poor
-    assert ps.train(dataset, epochs=1, filters=(4, 4, 4), padding="causal").scores["int8"] is None
+    assert ps.train(dataset, epochs=1, filters=(4, 4, 4), padding="causal").scores.int8 is None
 
 
 def test_fine_tuning_what_cannot_be_deployed_is_refused_before_training(dataset: Dataset) -> None:

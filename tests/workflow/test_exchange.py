@@ -54,7 +54,7 @@ def test_a_folder_for_hugging_face_is_imported_again(dataset: Dataset, tmp_path:
     assert head[:3] == ["configs:", "- config_name: recordings", "  data_files: recordings.parquet"]
     layout = files[1]
     again = ps.import_recordings(files[2], tmp_path / "A", layout=layout)
-    assert (again.streams, again.to_dict()["warnings"]) == (0, [])
+    assert (again.streams, again.messages) == (0, ())
     assert contents(again.dataset, located=False) == contents(dataset, located=False)
     again = ps.import_recordings(files[3], tmp_path / "B", layout=layout)
     assert contents(again.dataset) == contents(dataset)
@@ -69,7 +69,7 @@ def test_xdf_files_are_imported_again(dataset: Dataset, tmp_path: Path) -> None:
     files = to_xdf(dataset, tmp_path / "xdf")
     assert [f.relative_to(tmp_path / "xdf").as_posix() for f in files[:1]] == ["P1/fulldatastream.xdf"]
     again = ps.import_recordings(tmp_path / "xdf", tmp_path / "A", layout=dataset.layout)
-    assert (len(files), again.to_dict()["warnings"]) == (len(dataset.streams), [])
+    assert (len(files), again.messages) == (len(dataset.streams), ())
     assert contents(again.dataset) == contents(dataset)
     clock = again.dataset.read_stream(again.dataset.streams[0].id).device_ms
     assert np.array_equal(np.diff(clock), np.diff(dataset.read_stream(dataset.streams[0].id).device_ms))

@@ -20,10 +20,10 @@ from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.adaptation import evaluate_adapting
 from plushsense.experiments.baselines.run import ComparisonSpec, baselines
-from plushsense.experiments.search.run import search
-from plushsense.experiments.streams.run import stream_benchmark
+from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
 from plushsense.experiments.sweep.run import sweep
 from plushsense.workflow.api import unfinished
+from plushsense.workflow.datasets import PublishSpec, share_copy
 
 PERSON = "Yv0nne-77"
 SMALL: dict[str, Any] = {"filters": (2, 3, 3), "context": "loop", "epochs": 2, "workers": 1}
@@ -71,12 +71,13 @@ def run_sweep(ds: Dataset, out: Path, hook: Hook) -> None:
     sweep(ds, epochs=(1, 2), split="by-subject:2", out=out, progress=hook, **GRID)
 
 
-def run_search(ds: Dataset, out: Path, hook: Hook) -> None:
-    search(ds, rungs=(1, 2), share=1.0, split="by-subject:2", out=out, progress=hook, **GRID)
+def run_halving(ds: Dataset, out: Path, hook: Hook) -> None:
+    sweep(ds, halving=True, epochs=(1, 2), share=1.0, split="by-subject:2", out=out, progress=hook, **GRID)
 
 
 def run_streams(ds: Dataset, out: Path, hook: Hook) -> None:
-    stream_benchmark(ds, split="by-subject:2", systems=("argmax", "hysteresis"), out=out, progress=hook, **SMALL)
+    spec = BenchmarkSpec("by-subject:2", ("argmax", "hysteresis"))
+    stream_benchmark(ds, spec=spec, out=out, progress=hook, **SMALL)
 
 
 def run_adapting(ds: Dataset, out: Path, hook: Hook) -> None:
@@ -89,7 +90,7 @@ def run_train(ds: Dataset, out: Path, hook: Hook) -> None:
 
 
 RUNS = (
-    run_evaluate, run_evaluate_in_processes, run_baselines, run_sweep, run_search, run_streams,
+    run_evaluate, run_evaluate_in_processes, run_baselines, run_sweep, run_halving, run_streams,
 )  # fmt: skip
 
 
@@ -206,7 +207,7 @@ def test_no_byte_of_the_person_is_left_that_is_not_listed(
     ps.evaluate(dataset, split="by-subject:2", out=dataset / "results" / "mine", workers=1, **net)
     shutil.copytree(dataset / "results" / "mine", dataset / "evaluations" / "mine")
     assert cli("backup", dataset, home / "backups" / "b.zip").status == 0
-    assert cli("pseudonymise", dataset, home / "copy", "--key", home / "key.csv").status == 0
+    assert share_copy(dataset, home / "copy", PublishSpec(key=home / "key.csv", pseudonyms=True)).files > 0
     shutil.copytree(folder.parent / "src" / PERSON, home / "recordings" / PERSON)
     shutil.copytree(folder.parent / "src" / PERSON, home / "discarded" / "recordings" / PERSON)
     for place, text in {

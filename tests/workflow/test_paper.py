@@ -61,12 +61,12 @@ def test_it_imports_whole(tmp_path: Path, top: str, underscores: bool, mapped: b
     archive = make_archive(tmp_path, top=top, underscores=underscores)
     subjects = {"subjects": tmp_path / "map.csv"} if mapped else {}
     done = ps.import_recordings(archive, tmp_path / "DS", layout="plush-15", **subjects)  # type: ignore[arg-type]
-    assert (done.recordings, done.rejected) == (21, [])
+    assert (done.recordings, done.rejected) == (21, ())
     assert done.gestures == ["At rest", "Back stroke 1", "Tail pull", "Tail tap 2"]
     assert done.subjects == (3 if mapped else 0)
     assert {r.subject for r in done.dataset.recordings if r.gesture == "At rest"} == {"none"}
     assert done.dataset.head.simulated
-    asked = any("--subjects map.csv" in w for w in done.to_dict()["warnings"])
+    asked = any("--subjects map.csv" in w for w in done.messages)
     assert asked is not mapped
     delays = [r for r in done.dataset.recordings if any("holds delays" in f for f in r.flags)]
     assert {r.gesture for r in delays} == {DELAYS}

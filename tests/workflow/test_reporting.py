@@ -1,4 +1,4 @@
-"""pseudonymise, backup, restore and forget as a user types them; models that were trained on somebody who leaves."""
+"""backup and forget as a user types them; models that were trained on somebody who leaves."""
 
 import json
 import shutil
@@ -14,37 +14,18 @@ from plushsense.workflow.datasets import forget
 Cli = Callable[..., Any]
 
 
-def test_pseudonymise(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
-    words = tmp_path / "words.txt"
-    words.write_text("zoe\n")
-    ran = cli("pseudonymise", dataset.path, tmp_path / "OUT", "--key", tmp_path / "key.csv", "--words", words, "--json")
-    assert ran.status == 0
-    assert {k: ran.json[k] for k in ("subjects", "recordings", "streams", "findings")} == {
-        "subjects": 5,
-        "recordings": 30,
-        "streams": 5,
-        "findings": [],
-    }
-    assert cli("info", tmp_path / "OUT", "--json").json["located_in_stream"] == 30
-    for key, said in ((tmp_path / "OUT" / "k.csv", "choose a place outside"), (words, "no key file")):
-        ran = cli("pseudonymise", dataset.path, tmp_path / "OUT2", "--key", key)
-        assert (ran.status, said in ran.err) == (2, True)
-    assert cli("pseudonymise", dataset.path, tmp_path / "O", "--key", "k", "--words", tmp_path / "no").status == 2
-    assert cli("pseudonymise", dataset.path, tmp_path / "O").status == 2
-
-
 def test_backup_check_and_restore(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
     file = tmp_path / "b.zip"
     saved = cli("backup", dataset.path, file, "--json").json
     assert (saved["recordings"], saved["subjects"], saved["hash"]) == (30, 5, dataset.hash)
     assert cli("backup", "--check", file, "--json").json["valid"] is True
-    assert cli("restore", file, tmp_path / "R", "--json").json["hash"] == dataset.hash
+    assert cli("backup", "--restore", file, tmp_path / "R", "--json").json["hash"] == dataset.hash
     file.write_bytes(file.read_bytes()[:-40])
     ran = cli("backup", "--check", file, "--json")
     assert (ran.status, ran.json["valid"]) == (1, False)
-    assert cli("restore", file, tmp_path / "R2").status == 2
+    assert cli("backup", "--restore", file, tmp_path / "R2").status == 2
     assert cli("backup", dataset.path).status == cli("backup", dataset.path, "x", "--check", file).status == 2
-    assert cli("backup").status == 2
+    assert cli("backup").status == cli("backup", "--restore", file).status == 2
 
 
 def test_forget_asks_first_and_names_the_models(cli: Cli, dataset: Dataset, bundle: Path, tmp_path: Path) -> None:

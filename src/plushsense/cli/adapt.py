@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from plushsense.cli.options import options
-from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import marks, settings
+from plushsense.cli.output import emit, figure, spread, table, warn
+from plushsense.cli.settings import marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
-    from plushsense.experiments.adaptation import Adapted
+    from plushsense.experiments.adaptation import Adapted, AdaptingResult
 
 
 def run(args: argparse.Namespace) -> int:
@@ -81,44 +81,44 @@ def _evaluate(args: argparse.Namespace) -> int:
         use=2 if args.use is None else args.use,
         random=args.choices or 0,
         int8=args.int8,
-        progress=say,
+        progress=report_jobs("adapting"),
         warn=warn,
     )
-    emit(args, result, _evaluation_lines(result))
+    emit(args, result.to_json(), _evaluation_lines(result))
     return 0
 
 
-def _evaluation_lines(e: dict[str, Any]) -> list[str]:
-    out = marks({**e, "leaky": False})
+def _evaluation_lines(result: AdaptingResult) -> list[str]:
+    scores, choice = result.scores, result.scores.choice
+    out = marks({"simulated": result.simulated, "leaky": False})
     out.append(
-        f"split {e['split']}, context {e['context']}; {plural(e['use'], 'recording')} of each gesture adapt, the rest "
-        f"test; {e['choices']} choices of recordings, {100 * e['refused']:.1f} % left the bundle as it is\n"
+        f"split {result.split}, context {scores.context}; {plural(choice.use, 'recording')} of each gesture adapt, the "
+        f"rest test; {scores.choices} choices of recordings, {100 * scores.refused:.1f} % left the bundle as it is\n"
     )
-    for engine, scores in e["engines"].items():
+    head = ("subject", "tested", "accuracy", "after", "macro-F1", "after", "more correct", "worst choice")
+    for engine, gains in scores.engines.items():
         rows = [
             (
-                row["subject"],
-                f"{row['recordings']:.0f}",
-                *(figure(row[f"{s}_{w}"]) for s in ("accuracy", "macro_f1") for w in ("before", "after")),
-                f"{row['right_change']:.1f}",
-                row["right_change_worst"],
+                row.subject,
+                f"{row.recordings:.0f}",
+                *(figure(row.scores[s][w]) for s in ("accuracy", "macro_f1") for w in ("before", "after")),
+                f"{row.right_change:.1f}",
+                row.right_change_worst,
             )
-            for row in scores["people"]
+            for row in gains.people
         ]
-        head = ("subject", "tested", "accuracy", "after", "macro-F1", "after", "more correct", "worst choice")
         out += [f"{engine}\n", table(head, rows), ""]
         for score, name in (("accuracy", "accuracy"), ("macro_f1", "macro-F1")):
             for when in ("before", "after", "gain", "first"):
                 label = "gain, first recordings" if when == "first" else when
-                out.append(f"{name} {label:<24}{spread(scores[score][when])}")
-        right = scores["right"]
+                out.append(f"{name} {label:<24}{spread(gains.scores[score][when])}")
+        right = gains.right
         out.append(
             f"recordings correct, after minus before: mean {right['mean']:.1f}; the person who gains least "
             f"{right['worst_mean']:.1f}, the worst single choice {right['worst']}; people worse by more than one: "
             f"{right['worse_people']}, choices: {100 * right['worse_choices']:.1f} %\n"
         )
-    if e["agreement"]:
-        same = e["agreement"]
+    if same := scores.agreement:
         out.append(
             f"float and int8 agree on {100 * same['before']:.1f} % of the windows, after adapting "
             f"{100 * same['after']:.1f} %"

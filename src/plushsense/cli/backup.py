@@ -1,8 +1,9 @@
-"""Implement ``plushsense backup DATASET FILE.zip``, ``backup --check FILE.zip`` and ``restore FILE.zip DEST``."""
+"""Implement ``plushsense backup DATASET FILE.zip``, ``backup --check FILE.zip``, ``backup --restore FILE.zip DEST``."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from typing import Any
 
 from plushsense.cli.output import emit, say
@@ -16,9 +17,11 @@ def run(args: argparse.Namespace) -> int:
 
     if args.check:
         return _check(args)
+    if args.restore:
+        return _restore(args)
     if not args.file:
         raise ConfigError("Give the data set and the new file:  plushsense backup DATASET FILE.zip")
-    done = backup(args.dataset, args.file, progress=ProgressReporter("saving")).to_dict()
+    done = asdict(backup(args.dataset, args.file, progress=ProgressReporter("saving")))
     for name in done["left_out"]:
         say(f"left out: {name} is a link, which is not followed")
     emit(args, done, f"{args.file}: {_counts(done)}; written and read back")
@@ -31,7 +34,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.dataset or args.file:
         raise ConfigError("--check reads one backup and writes nothing: give  plushsense backup --check FILE.zip")
     try:
-        found = check_backup(args.check, progress=ProgressReporter("reading")).to_dict()
+        found = asdict(check_backup(args.check, progress=ProgressReporter("reading")))
     except DatasetError as error:
         say(f"plushsense: {error}")
         emit(args, {"file": args.check, "valid": False, "problem": str(error)}, f"{args.check}: not valid")
@@ -40,24 +43,18 @@ def _check(args: argparse.Namespace) -> int:
     return 0
 
 
-def run_restore(args: argparse.Namespace) -> int:
+def _restore(args: argparse.Namespace) -> int:
     from plushsense.dataset.backup import restore
     from plushsense.dataset.importing.archives import UnpackLimits
 
+    if not args.dataset or args.file:
+        raise ConfigError("Give the backup and one new folder:  plushsense backup --restore FILE.zip DATASET")
     limits = UnpackLimits.of_gigabytes(args.max_gb)
-    dataset = restore(args.file, args.dest, progress=ProgressReporter("restoring"), limits=limits)
-    result = {
-        "dataset": args.dest,
-        "recordings": len(dataset.recordings),
-        "subjects": len(dataset.subjects),
-        "streams": len(dataset.streams),
-        "hash": dataset.hash,
-    }
-    emit(
-        args,
-        result,
-        f"{args.dest}: restored {plural(result['recordings'], 'recording')} of {plural(result['subjects'], 'person')}",
-    )
+    dataset = restore(args.restore, args.dataset, progress=ProgressReporter("restoring"), limits=limits)
+    counts = {"recordings": len(dataset.recordings), "subjects": len(dataset.subjects)}
+    result = {"dataset": args.dataset, **counts, "streams": len(dataset.streams), "hash": dataset.hash}
+    people = plural(counts["subjects"], "person")
+    emit(args, result, f"{args.dataset}: restored {plural(counts['recordings'], 'recording')} of {people}")
     return 0
 
 

@@ -1,15 +1,19 @@
-"""Implement ``plushsense check DATASET [--only CHECK,…] [--report FILE.html] [--accept CHECK:RECORDING --why "…"]``."""
+"""Implement ``plushsense check DATASET [--only CHECK,…] [--report FILE.html] [--accept CHECK:RECORDING --why "…"]``.
+
+With options such as ``--label`` and ``--relabel`` it writes labels instead of running the checks.
+"""
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
-from plushsense.cli.output import emit, say
-from plushsense.cli.settings import listed
+from plushsense.cli.output import emit, say, table
+from plushsense.cli.settings import listed, seconds_between
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
@@ -20,12 +24,15 @@ if TYPE_CHECKING:
 
 _LINES = 8
 _DECISIONS = 20
+_STRETCHES = 40
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.quality.checking import known_checks
     from plushsense.workflow.datasets import decide
 
+    if _decides_labels(args):
+        return _label(args)
     only = listed(args.only)
     known_checks(only)
     if args.report:
@@ -59,6 +66,49 @@ def _limits(texts: Sequence[str]) -> dict[str, float]:
         except ValueError:
             raise ConfigError(f"--limit {text}: give a name and a number, e.g. duration=0.5.") from None
     return limits
+
+
+def _decides_labels(args: argparse.Namespace) -> bool:
+    """Return whether an option of labels is given."""
+    return bool(args.label or args.unlabel or args.relabel or args.labels or args.save_labels)
+
+
+def _label(args: argparse.Namespace) -> int:
+    from plushsense.dataset.labelling import check_labels_path, decide_labels, write_stretches
+
+    if args.save_labels:
+        check_labels_path(args.save_labels)
+    done = decide_labels(
+        args.dataset,
+        label=[(stream, seconds_between("--label", times), label) for stream, times, label in args.label],
+        unlabel=[(stream, seconds_between("--unlabel", times)) for stream, times in args.unlabel],
+        relabel=args.relabel,
+        file=args.labels,
+        **options(args, "who", "why"),
+    )
+    if args.save_labels:
+        write_stretches(args.save_labels, done.stretches)
+        say(f"written: {args.save_labels}")
+    seconds: dict[str, float] = {}
+    for s in done.stretches:
+        seconds[s.label] = seconds.get(s.label, 0.0) + s.stop_s - s.start_s
+    result: dict[str, Any] = {
+        "stretches": [asdict(s) for s in done.stretches],
+        "seconds": {label: round(total, 1) for label, total in sorted(seconds.items())},
+        "labelled": done.labelled,
+        "undone": done.undone,
+        "relabelled": list(done.relabelled),
+    }
+    for word, given in (("labelled", args.label or args.labels), ("undone", args.unlabel)):
+        if given:
+            say(f"{word} {result[word]}")
+    if args.relabel:
+        say(f"relabelled {plural(len(done.relabelled), 'recording')}")
+    rows = [(s.stream, f"{s.start_s:.2f}", f"{s.stop_s:.2f}", s.label) for s in done.stretches]
+    listing = [table(("stream", "start s", "stop s", "label"), rows), ""] if 0 < len(rows) <= _STRETCHES else []
+    totals = "".join(f"; {label} {total:.0f} s" for label, total in sorted(seconds.items()))
+    emit(args, result, [*listing, f"{plural(len(rows), 'labelled stretch')}{totals}"])
+    return 0
 
 
 def overview(result: CheckReport) -> Iterator[str]:

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         warn=warn,
     )
     report = write_report(out / PAGE, dataset, [out])
-    content = {**result.to_dict(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
+    content = {**result.to_json(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
     say(f"written: {out}")
     emit(args, content, lines(content))
     return 0
@@ -139,7 +139,7 @@ def _sweep_report(args: argparse.Namespace) -> int:
             f"'{args.out}' is a sweep: --dataset, --evaluation, --model and --recording are for a page of evaluations."
         )
     done = write_sweep_report(args.out, args.page, title=args.title, mlflow=args.mlflow)
-    emit(args, done, [f"{done['report']}: {done['done']} of {plural(done['trials'], 'trial')}", *done["said"]])
+    emit(args, done.to_json(), [f"{done.report}: {done.done} of {plural(done.trials, 'trial')}", *done.summary])
     return 0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
@@ -12,6 +12,9 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import plural
 from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.jobs.progress import ProgressReporter
+
+if TYPE_CHECKING:
+    from plushsense.dataset.importing.results import ImportPreview, ImportResult
 
 _MOST_WARNINGS = 20
 _FEW = 5
@@ -26,24 +29,24 @@ def _columns(texts: list[str]) -> dict[str, str]:
     return columns
 
 
-def _report(result: dict[str, Any], names: str) -> None:
+def _report(result: ImportResult | ImportPreview, names: str) -> None:
     """Print warnings, and what was left out or rejected, on standard error; ``names`` says where all warnings are."""
-    for line in result["warnings"][:_MOST_WARNINGS]:
+    for line in result.messages[:_MOST_WARNINGS]:
         say(line if getattr(line, "reason", "") == "adopted" else f"warning: {line}")
-    if len(result["warnings"]) > _MOST_WARNINGS:
-        say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings{names}")
-    for sensor in result.get("sensors", ()):
-        say(f"accelerometer {', '.join(sensor['axes'])}: {sensor['summary']}")
-    for proposal in (p for p in result.get("proposals", ()) if not p["adopted"]):
-        say(f"suggestion: {proposal['reason']}: {proposal['advice']}")
-    for status in ("left_out", "rejected"):
+    if len(result.messages) > _MOST_WARNINGS:
+        say(f"... and {len(result.messages) - _MOST_WARNINGS} more warnings{names}")
+    for sensor in result.sensors:
+        say(f"accelerometer {', '.join(sensor.axes)}: {sensor.summary}")
+    for proposal in (p for p in result.proposals if not p.adopted):
+        say(f"suggestion: {proposal.reason}: {proposal.advice}")
+    for status, entries in (("left out", result.left_out), ("rejected", result.rejected)):
         by_reason: dict[str, list[str]] = {}
-        for entry in result[status]:
-            by_reason.setdefault(entry["reason"], []).append(entry["file"])
+        for entry in entries:
+            by_reason.setdefault(entry.reason, []).append(entry.file)
         for reason, files in by_reason.items():
             several = f"{len(files)} files, for instance " if len(files) > _FEW else ""
             for file in files[: 1 if several else _FEW]:
-                say(f"{status.replace('_', ' ')}: {several}{file}: {reason}")
+                say(f"{status}: {several}{file}: {reason}")
 
 
 def _guess(args: argparse.Namespace) -> int:
@@ -60,27 +63,27 @@ def _guess(args: argparse.Namespace) -> int:
 def _dry_run(args: argparse.Namespace, given: dict[str, Any]) -> int:
     from plushsense.dataset.importing.importers import preview_import
 
-    found = preview_import(args.source, **given).to_dict()
+    found = preview_import(args.source, **given)
     if not args.json:
         _report(found, "")
-    channels = list(found["rows"][0]["values"]) if found["rows"] else []
-    shown = channels[:_MOST_CHANNELS]
-    more = [f"and {len(channels) - len(shown)} more channels"] if len(channels) > len(shown) else []
+    channels = list(found.rows[0].values) if found.rows else []
+    few = channels[:_MOST_CHANNELS]
+    more = [f"and {len(channels) - len(few)} more channels"] if len(channels) > len(few) else []
     rows = [
-        [row["subject"], row["session"], row["gesture"], row["time_ms"]]
-        + ["invalid" if row["values"][c] is None else format(row["values"][c], "g") for c in shown]
-        for row in found["rows"]
+        [row.subject, row.session, row.gesture, row.time_ms]
+        + ["invalid" if (value := row.values[c]) is None else format(value, "g") for c in few]
+        for row in found.rows
     ]
-    people = set(found["subjects"]) - {NOBODY, UNKNOWN_SUBJECT}
-    gestures = ", ".join(f"{label} ({n})" for label, n in found["gestures"].items())
+    people = set(found.subjects) - {NOBODY, UNKNOWN_SUBJECT}
+    gestures = ", ".join(f"{label} ({n})" for label, n in found.gestures.items())
     emit(
         args,
-        found,
+        found.to_json(),
         [
-            table(["person", "session", "gesture", "time in ms", *shown], rows),
+            table(["person", "session", "gesture", "time in ms", *few], rows),
             *more,
-            f"{plural(found['recordings'], 'recording')} of {plural(len(people), 'person')}, "
-            f"{plural(found['streams'], 'stream')}, layout {found['layout']}; nothing was written",
+            f"{plural(found.recordings, 'recording')} of {plural(len(people), 'person')}, "
+            f"{plural(found.streams, 'stream')}, layout {found.layout}; nothing was written",
             *([f"gestures: {gestures}"] if gestures else []),
         ],
     )
@@ -111,16 +114,15 @@ def run(args: argparse.Namespace) -> int:
         add_to=args.add,
         adopt_proposals=args.adopt,
     )
-    result = done.to_dict()
     if not args.json:
-        _report(result, f"; all are in {args.dest}/*.csv")
-    new = f", {done.added['recordings']} of them new, {done.already_there} files already there" if args.add else ""
+        _report(done, f"; all are in {args.dest}/*.csv")
+    new = f", {done.added_recordings} of them new, {done.already_there} files already there" if args.add else ""
     emit(
         args,
-        result,
+        done.to_json(),
         f"{args.dest}: {plural(done.recordings, 'recording')} of {plural(done.subjects, 'person')}{new}, "
         f"{plural(len(done.gestures), 'gesture')}, {plural(done.streams, 'stream')}; "
-        f"{plural(len(result['warnings']), 'warning')}, {plural(len(done.rejected), 'file')} rejected; "
+        f"{plural(len(done.messages), 'warning')}, {plural(len(done.rejected), 'file')} rejected; "
         f"{done.seconds:.1f} s",
     )
     return 0

@@ -1,4 +1,4 @@
-"""Implement ``plushsense info DATASET|BUNDLE``, ``stats DATASET [--by COLUMN]`` and ``arch SPEC --filters 8,12,16``."""
+"""Implement ``plushsense info DATASET|BUNDLE [--durations]`` and ``arch SPEC --filters 8,12,16``."""
 
 from __future__ import annotations
 
@@ -14,24 +14,33 @@ from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
     from plushsense.dataset.statistics import Duration, SummaryStatistics
+    from plushsense.dataset.store import Dataset
 
 
 def run(args: argparse.Namespace) -> int:
+    statistics = bool(args.durations or args.by or args.channels)
     if Path(args.path).suffix == ".plush":
+        if statistics:
+            raise ConfigError(f"'{args.path}' is a bundle: --durations, --by and --channels describe a data set.")
         return _bundle(args)
     from plushsense.dataset.index import open_dataset
 
     dataset = open_dataset(args.path)
     summary = dataset.summary()
     rows = [(g["label"], g["affect"], g["recordings"], g["subjects"], g["median_s"]) for g in summary["gestures"]]
-    emit(
-        args,
-        summary,
-        f"{dataset!r}\nlayout {summary['layout']}, {plural(summary['located_in_stream'], 'recording')} located "
-        "in a stream, "
-        f"{summary['with_warnings']} with warnings, {summary['excluded']} excluded\nhash {summary['hash']}\n\n"
-        + table(("gesture", "affect", "recordings", "people", "median s"), rows),
-    )
+    text = [
+        repr(dataset),
+        f"layout {summary['layout']}, {plural(summary['located_in_stream'], 'recording')} located in a stream, "
+        f"{summary['with_warnings']} with warnings, {summary['excluded']} excluded",
+        f"hash {summary['hash']}",
+        "",
+        table(("gesture", "affect", "recordings", "people", "median s"), rows),
+    ]
+    if statistics:
+        more, lines = _statistics(args, dataset)
+        summary |= more
+        text += ["", *lines]
+    emit(args, summary, text)
     return 0
 
 
@@ -61,25 +70,21 @@ def _bundle(args: argparse.Namespace) -> int:
     return 0
 
 
-def run_stats(args: argparse.Namespace) -> int:
-    from plushsense.dataset.index import open_dataset
+def _statistics(args: argparse.Namespace, dataset: Dataset) -> tuple[dict[str, Any], list[str]]:
+    """Return the durations of the recordings, and with ``--channels`` the values of the channels: JSON and text."""
     from plushsense.dataset.statistics import channel_table, duration_table
 
-    dataset = open_dataset(args.dataset)
     durations = duration_table(dataset, args.by)
     channels = channel_table(dataset) if args.channels else []
     trimmed = sum(r.stop - r.start < r.rows for r in dataset.used)
     result: dict[str, Any] = {
-        "dataset": dataset.head.name,
         "by": args.by,
-        "simulated": dataset.head.simulated,
-        "recordings": len(dataset.used),
         "trimmed": trimmed,
         "durations": [asdict(d) for d in durations],
         "channels": [asdict(c) for c in channels],
     }
     simulated = " (a simulation: it says nothing about people)" if dataset.head.simulated else ""
-    text = [f"{dataset.head.name}{simulated}: {plural(len(dataset.used), 'recording')}, {trimmed} trimmed", ""]
+    text = [f"Durations{simulated}: {plural(len(dataset.used), 'recording')}, {trimmed} trimmed", ""]
     text += ["Whole recordings", _duration_table(durations, args.by, after=False), ""]
     if trimmed:
         text += ["After trimming", _duration_table(durations, args.by, after=True), ""]
@@ -87,8 +92,7 @@ def run_stats(args: argparse.Namespace) -> int:
         head = ("gesture", "channel", "unit", "rows", "mean", "sd")
         rows = [(c.gesture, c.channel, c.unit, c.rows, f"{c.mean:.4g}", f"{c.sd:.4g}") for c in channels]
         text += ["Channels, after trimming", table(head, rows)]
-    emit(args, result, text)
-    return 0
+    return result, text
 
 
 def _duration_table(durations: list[Duration], by: str | None, after: bool) -> str:

@@ -1,13 +1,19 @@
-"""Implement ``plushsense publish DATASET OUT`` and ``plushsense publish --check PACKAGE``."""
+"""Implement ``plushsense publish DATASET OUT [--without-metadata]`` and ``plushsense publish --check PACKAGE``."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
 from plushsense.cli.settings import listed, report_stages
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
+
+if TYPE_CHECKING:
+    from plushsense.workflow.datasets import PublishSpec
 
 _MOST_PROBLEMS = 20
 
@@ -29,29 +35,43 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _publish(args: argparse.Namespace) -> int:
-    from plushsense.workflow.datasets import publish_dataset
+    from plushsense.workflow.datasets import PublishSpec, publish_dataset, share_copy
 
     if not args.dataset or not args.out:
         raise ConfigError("Publishing needs DATASET and OUT, or --check PACKAGE.  See  plushsense publish --help")
-    done = publish_dataset(
-        args.dataset,
-        args.out,
-        **options(args, "licence", "contact", "consent", "save", "key", "seed", "thorough"),
+    spec = PublishSpec(
+        **options(args, "licence", "contact", "consent", "save", "key", "pseudonyms", "seed", "thorough"),
         streams=not args.no_streams,
         excluded=args.allow_excluded,
         columns=tuple(listed(args.allow_columns)),
         reidentification=not args.no_reidentification,
-        progress=report_stages(),
     )
+    if args.without_metadata:
+        copy = share_copy(args.dataset, args.out, spec, report_stages())
+        _print_notes(args, copy.notes)
+        text = f"{args.out}: {plural(len(copy.dataset.recordings), 'recording')} with shifted times"
+        emit(args, copy.to_dict(), [text, *_about_key(spec)])
+        return 0
+    done = publish_dataset(args.dataset, args.out, spec, report_stages())
     result = done.to_dict()
-    if not args.json:
-        for line in [*result["warnings"], *result["notes"]]:
-            say(f"note: {line}")
+    _print_notes(args, [*done.warnings, *done.description.notes])
     _print_problems(args, result["problems"])
     megabytes = f"{result['bytes'] / 1e6:.1f} MB"
     verdict = f"valid; {result['zip']}" if done.valid else f"not valid: {len(result['problems'])} problems, no zip"
-    emit(args, result, f"{args.out}: {done.files} files, {megabytes}, {verdict}; {result['seconds']} s")
+    text = f"{args.out}: {done.files} files, {megabytes}, {verdict}; {result['seconds']} s"
+    emit(args, result, [text, *_about_key(spec)])
     return 0 if done.valid else 1
+
+
+def _about_key(spec: PublishSpec) -> list[str]:
+    if not spec.pseudonyms:
+        return []
+    return [f"The codes of the people are in {spec.key}: store it apart from the data, and never publish it."]
+
+
+def _print_notes(args: argparse.Namespace, notes: Iterable[str]) -> None:
+    for line in () if args.json else notes:
+        say(f"note: {line}")
 
 
 def _print_problems(args: argparse.Namespace, problems: list[dict[str, str]]) -> None:

@@ -12,6 +12,7 @@ from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.jobs.progress import JobProgress
+    from plushsense.training.spec import EpochProgress, EpochRow
     from plushsense.workflow.config import RunConfig
 
 SIMULATION = "SIMULATION: these scores say nothing about a real toy."
@@ -20,6 +21,21 @@ SIMULATION = "SIMULATION: these scores say nothing about a real toy."
 def listed(*values: str) -> list[str]:
     """Split the values of an option that accepts lists such as ``A,B`` and may be given several times."""
     return [word.strip() for value in values for word in value.split(",") if word.strip()]
+
+
+def seconds_between(option: str, text: str) -> tuple[float | None, float | None]:
+    """Return the seconds of ``FROM:TO``; None where one is left out.
+
+    Raises:
+        ConfigError: for another text; the message names ``option``.
+    """
+    start, colon, stop = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return (float(start) if start.strip() else None, float(stop) if stop.strip() else None)
+    except ValueError:
+        raise ConfigError(f"{option} was given '{text}': seconds as FROM:TO are accepted, such as 0.35:2.1.") from None
 
 
 _MOST_SEEDS = 1000
@@ -65,11 +81,11 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
     )
 
 
-def report_epochs(title: str = "training") -> Callable[[int, int, dict[str, Any]], None]:
+def report_epochs(title: str = "training") -> EpochProgress:
     """Return a callback that displays the epochs of one training."""
     reporters: dict[str, ProgressReporter] = {}
 
-    def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+    def report(epoch: int, epochs: int, row: EpochRow) -> None:
         loss = row["train_loss"]  # the loss of fine-tuning is of another kind, and small
         text = f"loss {loss:{'.3f' if loss >= 0.01 else '.1e'}}"
         if row["accuracy"] is not None:

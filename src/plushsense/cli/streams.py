@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, table, warn
@@ -13,6 +13,10 @@ from plushsense.cli.settings import listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
+
+if TYPE_CHECKING:
+    from plushsense.experiments.protocol.score import ProtocolResult
+    from plushsense.experiments.streams.run import PredictionsResult, StreamEvalResult
 
 
 def run_stream_eval(args: argparse.Namespace) -> int:
@@ -31,12 +35,13 @@ def run_stream_eval(args: argparse.Namespace) -> int:
         return _run_split(args)
     if args.out or args.systems or args.anywhere_pool is not None:
         raise ConfigError("--out, --systems and --anywhere-pool belong to --split: leave them out, or give --split.")
-    result = _score_model(args) if args.model is not None else _score_predictions(args)
+    scored = _score_model(args) if args.model is not None else _score_predictions(args)
+    result = scored.to_json()
     emit(args, result, _format_scores(result))
     return 0
 
 
-def _score_model(args: argparse.Namespace) -> dict[str, Any]:
+def _score_model(args: argparse.Namespace) -> StreamEvalResult:
     from plushsense.experiments.streams.run import stream_eval
 
     return stream_eval(
@@ -50,7 +55,7 @@ def _score_model(args: argparse.Namespace) -> dict[str, Any]:
     )
 
 
-def _score_predictions(args: argparse.Namespace) -> dict[str, Any]:
+def _score_predictions(args: argparse.Namespace) -> PredictionsResult:
     from plushsense.experiments.streams.run import score_predictions
 
     return score_predictions(
@@ -66,7 +71,7 @@ def _score_predictions(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _run_split(args: argparse.Namespace) -> int:
-    from plushsense.experiments.streams.run import PAGE, stream_benchmark
+    from plushsense.experiments.streams.run import PAGE, BenchmarkSpec, stream_benchmark
 
     if args.subjects:
         raise ConfigError("--subjects belongs to --model and --predictions: a split scores all people.")
@@ -74,13 +79,15 @@ def _run_split(args: argparse.Namespace) -> int:
     result = stream_benchmark(
         args.source,
         config,
-        split=args.split,
-        systems=None if args.systems is None else listed(args.systems),
+        BenchmarkSpec(
+            args.split,
+            None if args.systems is None else listed(args.systems),
+            args.late,
+            args.labels == "use",
+            args.anywhere_pool,
+        ),
         out=args.out,
         overwrite=args.force,
-        late_s=args.late,
-        labels=args.labels == "use",
-        anywhere_pool_s=args.anywhere_pool,
         progress=report_jobs("streams"),
         warn=warn,
     )
@@ -195,37 +202,38 @@ def _format_systems(result: dict[str, Any]) -> list[str]:
 
 
 def run_protocol(args: argparse.Namespace) -> int:
-    from plushsense.experiments.protocol.run import protocol
+    from plushsense.experiments.protocol.run import VirtualPeople, protocol
 
     virtual = options(args, "people", "first", "seed", "repetitions")
     virtual = {name: value for name, value in virtual.items() if value is not None}
     if virtual and (args.dataset or args.session):
         raise ConfigError(f"--{next(iter(virtual))} is for virtual people: leave it out, or --dataset and --session.")
+    reporter = ProgressReporter("people")
     result = protocol(
         args.model,
-        **virtual,
+        virtual=VirtualPeople(**virtual),
         **options(args, "dataset", "session", "engine", "out"),
         subjects=listed(args.subjects) if args.subjects else None,
         rules=not args.no_rules,
-        progress=ProgressReporter("people"),
+        progress=lambda at: reporter(at.done, at.total),
     )
-    emit(args, result, _protocol_lines(result))
+    emit(args, result.to_json(), _protocol_lines(result))
     return 0
 
 
-def _protocol_lines(result: dict[str, Any]) -> list[str]:
+def _protocol_lines(result: ProtocolResult) -> list[str]:
     """Format the outcome of the protocol as text: the table, the aims and the notes."""
     from plushsense.experiments.protocol.report import SIMULATION, aim_table, between_table, group_table
 
-    out = [result["heading"], *([SIMULATION] if result["simulated"] else [])]
-    out += [f"{name}: {value}" for name, value in result["about"]]
+    out = [result.heading, *([SIMULATION] if result.simulated else [])]
+    out += [f"{name}: {value}" for name, value in result.about]
     out += ["", group_table(result).text(), ""]
     out += [
         f"{row['system']}, {row['minutes']} minutes between the gestures: {row['positive']} positive and "
         f"{row['negative']} negative events, {row['none']} without affect: {row['reactions']} an hour"
         for row in between_table(result).rows
     ]
-    if result["aims"]:
+    if result.aims:
         out += ["", *(f"{row['met']}: {row['aim']}: {row['measured']}" for row in aim_table(result).rows)]
-    out += ["", *result["said"]]
-    return [*out, f"written: {result['files'][0]}"] if "files" in result else out
+    out += ["", *result.said]
+    return [*out, f"written: {result.files[0]}"] if result.files else out

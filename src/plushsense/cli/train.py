@@ -14,6 +14,7 @@ from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
     from plushsense.models.bundle import Bundle
+    from plushsense.workflow.api import TrainingScores
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,22 +32,21 @@ def run(args: argparse.Namespace) -> int:
         warn=warn,
     )
     bundle = done.save(args.out)
-    scores = done.scores
-    int8 = scores["int8"]
-    mark = "  [SIMULATION]" if scores["simulated"] else ""
+    scores, int8 = done.scores, done.scores.int8
+    mark = "  [SIMULATION]" if scores.simulated else ""
     emit(
         args,
-        {"bundle": str(bundle), "history": done.history, "scores": scores, "decision": done.bundle.decision},
+        {"bundle": str(bundle), "history": done.history, "scores": scores.to_json(), "decision": done.bundle.decision},
         [
             f"{bundle}: {done.bundle.arch.symbol}, {done.bundle.arch.parameters:,} parameters, "
-            f"epoch {scores['best_epoch']} of {len(done.history)} kept{mark}",
+            f"epoch {scores.best_epoch} of {len(done.history)} kept{mark}",
             _reads(done.bundle),
-            f"accuracy {figure(scores['accuracy'])}, macro-F1 {figure(scores['macro_f1'])} on {scores['windows']} "
-            f"windows of {scores['said']}{_counted(scores)}.",
+            f"accuracy {figure(scores.accuracy)}, macro-F1 {figure(scores.macro_f1)} on {scores.windows} "
+            f"windows of {scores.description}{_counted(scores)}.",
             *(
                 [
-                    f"In 8 bits, as in the toy: accuracy {figure(int8['accuracy'])}, macro-F1 "
-                    f"{figure(int8['macro_f1'])}; the same answer on {100 * int8['agreement']:.1f} % of them."
+                    f"In 8 bits, as in the toy: accuracy {figure(int8.accuracy)}, macro-F1 "
+                    f"{figure(int8.macro_f1)}; the same answer on {100 * int8.agreement:.1f} % of them."
                 ]
                 if int8
                 else []
@@ -66,13 +66,13 @@ def _reads(bundle: Bundle) -> str:
     )
 
 
-def _counted(scores: Mapping[str, Any]) -> str:
+def _counted(scores: TrainingScores) -> str:
     from plushsense.reports.wording import MEAN
     from plushsense.workflow.preparation import WHOLE_PEOPLE
 
-    rest = scores["nobody"]
-    apart = f", whose accuracy is {figure(rest['accuracy'])}" if rest else ""
-    return f" ({MEAN}{apart})" if scores["split"] == WHOLE_PEOPLE else ""
+    rest = scores.nobody
+    apart = f", whose accuracy is {figure(rest.accuracy)}" if rest else ""
+    return f" ({MEAN}{apart})" if scores.split == WHOLE_PEOPLE else ""
 
 
 def decided(decision: Mapping[str, Any]) -> list[str]:

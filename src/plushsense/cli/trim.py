@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
+from plushsense.cli.settings import seconds_between
 from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
@@ -28,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
         args.dataset,
         **options(args, "only", "accept", "undo", "offset", "who", "why"),
         above=args.accept_above,
-        keep=[(identity, *_seconds(text)) for identity, text in args.set],
+        keep=[(identity, *seconds_between("--set", text)) for identity, text in args.set],
         progress=ProgressReporter("reading"),
     )
     drawn: list[Path] = []
@@ -44,18 +45,6 @@ def run(args: argparse.Namespace) -> int:
 def _decides(args: argparse.Namespace) -> bool:
     """Return whether the given options change marks."""
     return bool(args.accept or args.set or args.undo) or args.accept_above is not None
-
-
-def _seconds(text: str) -> tuple[float | None, float | None]:
-    from plushsense.core.errors import ConfigError
-
-    start, colon, stop = text.partition(":")
-    try:
-        if not colon:
-            raise ValueError
-        return (float(start) if start.strip() else None, float(stop) if stop.strip() else None)
-    except ValueError:
-        raise ConfigError(f"--set was given '{text}': seconds as FROM:TO are accepted, such as 0.35:2.1.") from None
 
 
 def _print(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> None:

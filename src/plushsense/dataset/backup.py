@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
@@ -20,6 +20,7 @@ from typing import IO, Any
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import new_folder, replacing_file, work_folder
+from plushsense.core.toml import load_table
 from plushsense.dataset.files import list_files
 from plushsense.dataset.importing.archives import DAMAGED, UnpackLimits, zip_entry
 from plushsense.dataset.index import open_dataset, rebuild_index
@@ -34,11 +35,36 @@ _LEFT_OUT = ("cache", "index", "working")
 _MANIFEST_LIMIT = 1 << 28
 # Exceptions for a damaged zip, or a member of the manifest that is missing.
 _BROKEN: tuple[type[Exception], ...] = (*DAMAGED, KeyError, IndexError)
-_NO_MANIFEST: tuple[type[Exception], ...] = (*_BROKEN, TypeError, OSError, RecursionError)
+_NO_MANIFEST: tuple[type[Exception], ...] = (*_BROKEN, TypeError, AttributeError, OSError, RecursionError)
 
 
 @dataclass(frozen=True)
-class Backup:
+class BackupFile:
+    """File in a backup, by its path in the data set."""
+
+    path: str
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """List of the files of a backup; ``hash`` is that of the data set."""
+
+    name: str
+    recordings: int
+    subjects: int
+    hash: str
+    files: tuple[BackupFile, ...]
+
+    def to_json(self) -> bytes:
+        """Return the text in the zip."""
+        table = {"format": FORMAT, "version": VERSION, **asdict(self)}
+        return f"{json.dumps(table, ensure_ascii=False, indent=0)}\n".encode()
+
+
+@dataclass(frozen=True)
+class BackupResult:
     """Summary of a backup; ``hash`` is that of the data set, ``left_out`` lists links, which are not backed up."""
 
     file: str
@@ -50,12 +76,8 @@ class Backup:
     hash: str
     left_out: tuple[str, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return asdict(self) | {"left_out": list(self.left_out)}
 
-
-def backup(dataset: str | Path, file: str | Path, progress: Progress | None = None) -> Backup:
+def backup(dataset: str | Path, file: str | Path, progress: Progress | None = None) -> BackupResult:
     """Write a data set into one new zip file, and read the zip again to verify it.
 
     Args:
@@ -66,47 +88,19 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
             fails. No incomplete zip is left.
     """
     folder, target = Path(dataset), Path(file)
-    if target.exists() or target.is_symlink():
-        message = f"'{target}' exists already: a backup never replaces another; give a new name."
-        raise DatasetError(message, reason="name_exists", name=target.name)
+    _refuse_existing(target, "exists already")
     if folder.resolve() in target.resolve().parents:
         raise DatasetError(f"'{target}' lies in the data set itself: give a place outside of '{folder}'.")
-    report = progress or (lambda done, total: None)
     source = open_dataset(folder)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         listed = [f for f in list_files(folder) if f.kind not in _LEFT_OUT]
         paths = [f.path for f in listed if f.kind != "link"]
-        for path in paths:
-            if _name_refusal(path.as_posix()):
-                name = path.as_posix().encode(errors="backslashreplace").decode()
-                message = f"'{name}' in '{folder}' has a name that a backup cannot hold on every system: rename it."
-                raise DatasetError(message, reason="backup_name", file=name)
-        total = 2 * sum((folder / path).stat().st_size for path in paths)
-        done = 0
-        files: list[dict[str, Any]] = []
-        manifest = {
-            "format": FORMAT,
-            "version": VERSION,
-            "name": source.head.name,
-            "recordings": len(source.recordings),
-            "subjects": len(source.subjects),
-            "hash": source.hash,
-            "files": files,
-        }
+        _refuse_names(folder, paths)
         finishing = source.generation.writing
         with work_folder(target) as work, replacing_file(target, within=work, finishing=finishing) as part:
-            with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
-                for path in paths:
-                    files.append(_store(archive, folder, path))
-                    done += files[-1]["bytes"]
-                    report(done, total)
-                text = json.dumps(manifest, ensure_ascii=False, indent=0) + "\n"
-                archive.writestr(zip_entry(MANIFEST), text.encode("utf-8"))
-            _verify(part, lambda n: report(total // 2 + n, total))
-            if target.exists():
-                message = f"'{target}' appeared meanwhile: a backup never replaces another; give a new name."
-                raise DatasetError(message, reason="name_exists", name=target.name)
+            manifest = _write(part, source, paths, progress or (lambda done, total: None))
+            _refuse_existing(target, "appeared meanwhile")
     except OSError as cause:
         raise DatasetError(
             f"The backup '{target}' cannot be written ({cause.strerror or cause}; '{cause.filename or target}'): "
@@ -118,7 +112,38 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
     return _summary(target, manifest, tuple(f.path.as_posix() for f in listed if f.kind == "link"))
 
 
-def check_backup(file: str | Path, progress: Progress | None = None) -> Backup:
+def _refuse_existing(target: Path, state: str) -> None:
+    if target.exists() or target.is_symlink():
+        message = f"'{target}' {state}: a backup never replaces another; give a new name."
+        raise DatasetError(message, reason="name_exists", name=target.name)
+
+
+def _refuse_names(folder: Path, paths: Iterable[PurePosixPath]) -> None:
+    for path in paths:
+        if _name_refusal(path.as_posix()):
+            name = path.as_posix().encode(errors="backslashreplace").decode()
+            message = f"'{name}' in '{folder}' has a name that a backup cannot hold on every system: rename it."
+            raise DatasetError(message, reason="backup_name", file=name)
+
+
+def _write(part: Path, source: Dataset, paths: Sequence[PurePosixPath], progress: Progress) -> Manifest:
+    """Write the zip ``part``, and verify it; half of the progress is the verification."""
+    folder = source.path
+    total, done = 2 * sum((folder / path).stat().st_size for path in paths), 0
+    files = []
+    with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in paths:
+            files.append(_store(archive, folder, path))
+            done += files[-1].bytes
+            progress(done, total)
+        people = len(source.subjects)
+        manifest = Manifest(source.head.name, len(source.recordings), people, source.hash, tuple(files))
+        archive.writestr(zip_entry(MANIFEST), manifest.to_json())
+    _verify(part, lambda n: progress(total // 2 + n, total))
+    return manifest
+
+
+def check_backup(file: str | Path, progress: Progress | None = None) -> BackupResult:
     """Verify that a backup contains exactly the files of its manifest, each unchanged.
 
     Raises:
@@ -153,30 +178,30 @@ def restore(
     """
     path, folder = Path(file), Path(dest)
     with _open_backup(path) as (archive, manifest):
-        total = sum(entry["bytes"] for entry in manifest["files"])
-        (limits or UnpackLimits()).check(path, len(manifest["files"]), total, folder)
+        total = sum(entry.bytes for entry in manifest.files)
+        (limits or UnpackLimits()).check(path, len(manifest.files), total, folder)
         done = 0
         with new_folder(folder, DatasetError, last=HEAD) as work:
-            for entry in manifest["files"]:
-                target = work / entry["path"]
+            for entry in manifest.files:
+                target = work / entry.path
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with target.open("xb") as out:
                     _read(path, archive, entry, out)
-                done += entry["bytes"]
+                done += entry.bytes
                 if progress is not None:
                     progress(done, total)
             again = rebuild_index(work).dataset
-            if again.hash != manifest["hash"]:
+            if again.hash != manifest.hash:
                 raise DatasetError(
                     f"The backup '{path}' restores another data set than the saved one ({len(again.recordings)} "
-                    f"recordings of {manifest['recordings']}): restore it with the PlushSense that wrote it.",
+                    f"recordings of {manifest.recordings}): restore it with the PlushSense that wrote it.",
                     reason="backup_other",
                     name=path.name,
                 )
     return open_dataset(folder)
 
 
-def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[str, Any]:
+def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> BackupFile:
     digest = hashlib.sha256()
     size = 0
     with (folder / path).open("rb") as file:
@@ -190,21 +215,12 @@ def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[
     if size != before.st_size or (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
         message = f"'{folder / path}' changed while it was saved: back up when nothing is recorded."
         raise DatasetError(message, reason="backup_changed", file=path.name)
-    return {"path": path.as_posix(), "bytes": size, "sha256": digest.hexdigest()}
+    return BackupFile(path.as_posix(), size, digest.hexdigest())
 
 
-def _summary(file: Path, manifest: dict[str, Any], left_out: tuple[str, ...] = ()) -> Backup:
-    files = manifest["files"]
-    return Backup(
-        str(file),
-        manifest["name"],
-        len(files),
-        sum(entry["bytes"] for entry in files),
-        manifest["recordings"],
-        manifest["subjects"],
-        manifest["hash"],
-        left_out,
-    )
+def _summary(file: Path, manifest: Manifest, left_out: tuple[str, ...] = ()) -> BackupResult:
+    m, total = manifest, sum(entry.bytes for entry in manifest.files)
+    return BackupResult(str(file), m.name, len(m.files), total, m.recordings, m.subjects, m.hash, left_out)
 
 
 def _damaged(path: Path, why: object) -> DatasetError:
@@ -213,7 +229,7 @@ def _damaged(path: Path, why: object) -> DatasetError:
 
 
 @contextmanager
-def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
+def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, Manifest]]:
     """Open a backup and check that its members are those of its manifest."""
     if path.exists() and not path.is_file():
         raise DatasetError(f"'{path}' is no file: give a backup.", reason="backup_damaged", name=path.name)
@@ -242,7 +258,7 @@ def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]
         if len(set(names)) != len(names):
             raise _damaged(path, "it holds a name twice")
         manifest = _manifest_of(path, archive)
-        listed = {entry["path"] for entry in manifest["files"]}
+        listed = {entry.path for entry in manifest.files}
         if odd := sorted(listed ^ (set(names) - {MANIFEST})):
             reason = "is missing" if odd[0] in listed else "is not in the manifest"
             raise _damaged(path, f"'{odd[0]}' {reason}")
@@ -273,56 +289,54 @@ def _refusal(info: zipfile.ZipInfo) -> str:
     return ""
 
 
-def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
+def _manifest_of(path: Path, archive: zipfile.ZipFile) -> Manifest:
     try:
         if archive.getinfo(MANIFEST).file_size > _MANIFEST_LIMIT:
             raise ValueError("its manifest is too long")
         table: dict[str, Any] = json.loads(archive.read(MANIFEST))
-        if table["format"] != FORMAT:
+        if table.pop("format") != FORMAT:
             raise ValueError("its manifest has another format")
-        if table["version"] != VERSION:
+        if (version := table.pop("version")) != VERSION:
             raise DatasetError(
-                f"The backup '{path}' has version {table['version']!r}; this PlushSense reads {VERSION}: update it.",
+                f"The backup '{path}' has version {version!r}; this PlushSense reads {VERSION}: update it.",
                 reason="backup_version",
                 name=path.name,
             )
-        kinds = {"name": str, "recordings": int, "subjects": int, "hash": str, "files": list}
-        entry_kinds = {"path": str, "bytes": int, "sha256": str}
-        whole = all(isinstance(table[k], kind) for k, kind in kinds.items()) and all(
-            isinstance(entry[k], kind) for entry in table["files"] for k, kind in entry_kinds.items()
-        )
-        whole = whole and all(entry["bytes"] >= 0 for entry in table["files"])
-        if not whole:
-            raise ValueError("its manifest lacks something")
     except _NO_MANIFEST as cause:
         raise _damaged(path, cause) from None
-    return table
+    try:
+        manifest = load_table(table, Manifest, "its manifest", DatasetError)
+    except DatasetError as cause:
+        raise _damaged(path, cause) from None
+    if any(entry.bytes < 0 for entry in manifest.files):
+        raise _damaged(path, "a file in its manifest has less than 0 bytes")
+    return manifest
 
 
-def _read(path: Path, archive: zipfile.ZipFile, entry: dict[str, Any], out: IO[bytes] | None = None) -> None:
+def _read(path: Path, archive: zipfile.ZipFile, entry: BackupFile, out: IO[bytes] | None = None) -> None:
     """Read a member, write it to ``out`` if given, and raise DatasetError if it differs from the manifest."""
     digest = hashlib.sha256()
     size = 0
     try:
-        with archive.open(entry["path"]) as member:
+        with archive.open(entry.path) as member:
             while chunk := member.read(_CHUNK):
                 size += len(chunk)
-                if size > entry["bytes"]:
+                if size > entry.bytes:
                     break
                 digest.update(chunk)
                 if out is not None:
                     out.write(chunk)
     except _BROKEN as cause:
-        raise _damaged(path, f"'{entry['path']}': {cause}") from None
-    if size != entry["bytes"] or digest.hexdigest() != entry["sha256"]:
-        raise _damaged(path, f"'{entry['path']}' differs from the saved file")
+        raise _damaged(path, f"'{entry.path}': {cause}") from None
+    if size != entry.bytes or digest.hexdigest() != entry.sha256:
+        raise _damaged(path, f"'{entry.path}' differs from the saved file")
 
 
-def _verify(path: Path, progress: Callable[[int], None]) -> dict[str, Any]:
+def _verify(path: Path, progress: Callable[[int], None]) -> Manifest:
     with _open_backup(path) as (archive, manifest):
         done = 0
-        for entry in manifest["files"]:
+        for entry in manifest.files:
             _read(path, archive, entry)
-            done += entry["bytes"]
+            done += entry.bytes
             progress(done)
     return manifest

@@ -6,9 +6,8 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import PART, foreign_link, write_file
@@ -58,15 +57,61 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def current_stamp(folder: Path) -> dict[str, Any]:
-    """Return the stamp of the present files: raw files (name, size, time in ns), hashes of the marks and the head."""
-    files = [(path.relative_to(folder).as_posix(), path.stat()) for _, path in raw_files(folder)]
-    return {
-        "format": STAMP_VERSION,
-        "files": [[name, now.st_size, now.st_mtime_ns] for name, now in files],
-        "marks": _marks_stamp(_marks(folder)),
-        "head": sha256_of(folder / HEAD),
-    }
+@dataclass(frozen=True)
+class IndexStamp:
+    """Fingerprint of the files that an index was built from, kept in ``index.json``.
+
+    ``files`` maps each raw file to its size and time in ns; ``marks`` are the length and hash of ``marks.jsonl``,
+    ``head`` is the hash of ``dataset.toml``, and ``index`` those of the index files, by name.
+    """
+
+    files: dict[str, tuple[int, int]]
+    marks: tuple[int, str]
+    head: str
+    index: dict[str, str]
+
+    @classmethod
+    def of(cls, folder: Path) -> IndexStamp:
+        """Return the stamp of the present files."""
+        raw = [(path.relative_to(folder).as_posix(), path.stat()) for _, path in raw_files(folder)]
+        files = {name: (now.st_size, now.st_mtime_ns) for name, now in raw}
+        return cls(files, _marks_stamp(_marks(folder)), sha256_of(folder / HEAD), _index_hashes(folder))
+
+    @classmethod
+    def read(cls, folder: Path) -> IndexStamp | None:
+        """Return the stamp on disk; None if there is none, or it is damaged or of an earlier version."""
+        try:
+            table = json.loads((folder / STAMP).read_text(encoding="utf-8"))
+            if table["format"] != STAMP_VERSION or list(map(type, table["marks"])) != [int, str]:
+                return None
+            files = {str(name): (int(size), int(time)) for name, size, time in table["files"]}
+            length, sha256 = table["marks"]
+            index = {str(name): str(value) for name, value in table["index"].items()}
+            return cls(files, (length, sha256), str(table["head"]), index)
+        except (FileNotFoundError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
+            return None
+
+    def write(self, folder: Path) -> None:
+        """Write the stamp into a data set."""
+        files = [[name, *state] for name, state in self.files.items()]
+        table = {"format": STAMP_VERSION, "files": files, "marks": self.marks, "head": self.head, "index": self.index}
+        write_file(folder / STAMP, json.dumps(table) + "\n")
+
+    def with_index(self, folder: Path) -> IndexStamp:
+        """Return the stamp with the hashes of the present index files; call this after writing these."""
+        return replace(self, index=_index_hashes(folder))
+
+    def missing(self, folder: Path) -> list[str]:
+        """Return the raw files that no longer exist."""
+        return [name for name in self.files if not (folder / name).is_file()]
+
+    def marks_rewritten(self, folder: Path) -> bool:
+        """Return whether marks are missing or differ that were there: marks are only appended."""
+        return _marks_stamp(_marks(folder)[: self.marks[0]]) != self.marks
+
+    def is_intact(self, folder: Path) -> bool:
+        """Return whether the index files are those of the stamp, even if raw files changed since."""
+        return self.index == _index_hashes(folder)
 
 
 def _marks(folder: Path) -> bytes:
@@ -76,72 +121,18 @@ def _marks(folder: Path) -> bytes:
         return b""
 
 
-def _marks_stamp(marks: bytes) -> list[Any]:
-    return [len(marks), hashlib.sha256(marks).hexdigest()]
+def _marks_stamp(marks: bytes) -> tuple[int, str]:
+    return len(marks), hashlib.sha256(marks).hexdigest()
 
 
 def _index_hashes(folder: Path) -> dict[str, str]:
     return {name: sha256_of(folder / name) for name in (RECORDINGS_INDEX, STREAMS_INDEX)}
 
 
-def write_stamp(folder: Path, stamp: dict[str, Any]) -> None:
-    """Write ``stamp`` with the hashes of the index files; call this after writing the index files."""
-    write_file(folder / STAMP, json.dumps(stamp | {"index": _index_hashes(folder)}) + "\n")
-
-
-def _read_stamp(folder: Path) -> dict[str, Any]:
-    """Return the stamp on disk; empty if there is none, or it is damaged."""
-    try:
-        stamp = json.loads((folder / STAMP).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError, RecursionError):
-        return {}
-    return stamp if isinstance(stamp, dict) else {}
-
-
-def is_index_fresh(folder: Path) -> bool:
-    """Return whether the index in ``folder`` is complete and was built from the present files."""
-    return _read_stamp(folder) == current_stamp(folder) | {"index": _index_hashes(folder)}
-
-
-def indexed_files(folder: Path) -> dict[str, int]:
-    """Return the size in bytes of each file of the stamp on disk, by name; call it only if the stamp is right."""
-    return {name: size for name, size, _ in _read_stamp(folder)["files"]}
-
-
-def is_same_raw_data(folder: Path, now: dict[str, Any]) -> bool:
-    """Return whether the index is complete and, except for the marks, was built from the files of the stamp ``now``."""
-    return _read_stamp(folder) | {"marks": now["marks"]} == now | {"index": _index_hashes(folder)}
-
-
-def missing_files(folder: Path) -> list[str]:
-    """Return the raw files of the stamp on disk that no longer exist; none if there is no stamp."""
-    try:
-        return [str(entry[0]) for entry in _read_stamp(folder)["files"] if not (folder / str(entry[0])).is_file()]
-    except (KeyError, TypeError, IndexError):
-        return []
-
-
-def rewritten_marks(folder: Path) -> bool:
-    """Return whether marks are missing or differ that were there when the stamp was written: marks are only appended.
-
-    False if there is no stamp, or it is damaged or of an earlier version.
-    """
-    stamp = _read_stamp(folder)
-    before = stamp.get("marks")
-    if stamp.get("format") != STAMP_VERSION or not isinstance(before, list) or list(map(type, before)) != [int, str]:
-        return False
-    return _marks_stamp(_marks(folder)[: before[0]]) != before
-
-
 def accept_marks(folder: Path) -> None:
     """Let the stamp on disk, if there is one, have the present marks, after marks were removed on purpose."""
-    if stamp := _read_stamp(folder):
-        write_file(folder / STAMP, json.dumps(stamp | {"marks": _marks_stamp(_marks(folder))}) + "\n")
-
-
-def is_index_intact(folder: Path) -> bool:
-    """Return whether the index files are those that were written with the stamp, even if raw files changed since."""
-    return _read_stamp(folder).get("index") == _index_hashes(folder)
+    if (stamp := IndexStamp.read(folder)) is not None:
+        replace(stamp, marks=_marks_stamp(_marks(folder))).write(folder)
 
 
 CACHE = "cache"

@@ -22,20 +22,7 @@ from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_by
 from plushsense.core.row_times import bridged_ms, stray_rows
 from plushsense.core.sentences import Sentence
 from plushsense.core.simulation import is_marked
-from plushsense.dataset.files import (
-    RECORDINGS_INDEX,
-    STAMP,
-    STREAMS_INDEX,
-    current_stamp,
-    indexed_files,
-    is_index_fresh,
-    is_index_intact,
-    is_same_raw_data,
-    missing_files,
-    raw_files,
-    rewritten_marks,
-    write_stamp,
-)
+from plushsense.dataset.files import RECORDINGS_INDEX, STAMP, STREAMS_INDEX, IndexStamp, raw_files
 from plushsense.dataset.marks import MARKS, MarkState, read_marks
 from plushsense.dataset.quality.checking import import_flags
 from plushsense.dataset.quality.findings import PARTLY_THERE
@@ -91,30 +78,20 @@ def open_dataset(path: str | Path) -> Dataset:
     head = DatasetHead.read(folder)
     try:
         generation = Generation.of(folder)
-        if is_index_fresh(folder) and (dataset := _indexed(folder, head, generation)) is not None:
-            return dataset
-        if missing := missing_files(folder):
-            raise DatasetError(
-                f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
-                f"('{missing[0]}'): restore them, or delete {STAMP} there to go on without them.",
-                reason="raw_files_missing",
-                folder=folder.name,
-                n=len(missing),
-                file=missing[0],
-            )
-        if rewritten_marks(folder):
-            raise DatasetError(
-                f"Marks that '{folder / MARKS}' had are missing or changed, but marks are only appended: restore the "
-                f"file, or delete {STAMP} there to go on with the marks as they are now.",
-                reason="marks_changed",
-                folder=folder.name,
-            )
-        stamp = current_stamp(folder)
+        before, now = IndexStamp.read(folder), IndexStamp.of(folder)
+        same_raw_data = before is not None and replace(before, marks=now.marks) == now
         # If only the marks changed, the raw files need not be read again.
-        dataset = _indexed(folder, head, generation) if is_same_raw_data(folder, stamp) else None
+        dataset = _indexed(folder, head, generation, now.files) if same_raw_data else None
+        if dataset is not None and before == now:
+            return dataset
+        if before is not None:
+            _refuse_losses(folder, before)
         if dataset is not None:
             dataset.recordings = apply_marks(dataset.recordings, read_marks(folder), head.gestures)
-        built = build_index(folder, head) if dataset is None else IndexBuild(dataset)
+        else:
+            dataset = _rebuilt(folder, head)
+            if before is not None and before.is_intact(folder):
+                _refuse_changed(folder, dataset)
     except OSError as cause:
         raise DatasetError(
             f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).",
@@ -122,6 +99,42 @@ def open_dataset(path: str | Path) -> Dataset:
             folder=folder.name,
             why=cause.strerror or str(cause),
         ) from None
+    try:
+        with generation.writing():
+            write_index_files(dataset, now)
+    except ForgottenError:
+        if Generation.of(folder) != generation:
+            return open_dataset(folder)
+        # The removal of a person was interrupted: the data can be used, and completing it writes the index.
+    except OSError:
+        # The disk is read-only; the index only saves time.
+        pass
+    return dataset
+
+
+def _refuse_losses(folder: Path, before: IndexStamp) -> None:
+    """Raise DatasetError if raw files or marks of the stamp ``before`` are missing."""
+    if missing := before.missing(folder):
+        raise DatasetError(
+            f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
+            f"('{missing[0]}'): restore them, or delete {STAMP} there to go on without them.",
+            reason="raw_files_missing",
+            folder=folder.name,
+            n=len(missing),
+            file=missing[0],
+        )
+    if before.marks_rewritten(folder):
+        raise DatasetError(
+            f"Marks that '{folder / MARKS}' had are missing or changed, but marks are only appended: restore the "
+            f"file, or delete {STAMP} there to go on with the marks as they are now.",
+            reason="marks_changed",
+            folder=folder.name,
+        )
+
+
+def _rebuilt(folder: Path, head: DatasetHead) -> Dataset:
+    """Return the data set with a new index; raise DatasetError if a raw file cannot be read."""
+    built = build_index(folder, head)
     if built.unreadable:
         file, reason = next(iter(built.unreadable.items()))
         raise DatasetError(
@@ -132,17 +145,6 @@ def open_dataset(path: str | Path) -> Dataset:
             folder=folder.name,
             file=file,
         )
-    _refuse_changed(folder, built.dataset)
-    try:
-        with generation.writing():
-            write_index_files(built.dataset, stamp)
-    except ForgottenError:
-        if Generation.of(folder) != generation:
-            return open_dataset(folder)
-        # The removal of a person was interrupted: the data can be used, and completing it writes the index.
-    except OSError:
-        # The disk is read-only; the index only saves time.
-        pass
     return built.dataset
 
 
@@ -152,8 +154,6 @@ def _digests(recordings: Iterable[RecordingInfo], streams: Iterable[StreamInfo])
 
 def _refuse_changed(folder: Path, now: Dataset) -> None:
     """Raise DatasetError if a raw file is not the one that the index on disk describes."""
-    if not is_index_intact(folder):
-        return
     try:
         recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
         streams = read_index(folder / STREAMS_INDEX, StreamInfo)
@@ -174,14 +174,19 @@ def _refuse_changed(folder: Path, now: Dataset) -> None:
         )
 
 
-def _indexed(folder: Path, head: DatasetHead, generation: Generation) -> Dataset | None:
-    """Return the data set as its index on disk describes it; None if the index is damaged."""
+def _indexed(
+    folder: Path, head: DatasetHead, generation: Generation, raw: Mapping[str, tuple[int, int]]
+) -> Dataset | None:
+    """Return the data set as its index on disk describes it; None if the index is damaged.
+
+    ``raw`` are the raw files with size and time.
+    """
     try:
         recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
         streams = read_index(folder / STREAMS_INDEX, StreamInfo)
     except DatasetError:
         return None
-    files = indexed_files(folder)
+    files = {name: size for name, (size, _) in raw.items()}
     known = {s.id: s for s in streams}
     right = all(_is_stream_of(s, files) for s in streams) and all(_is_recording_of(r, files, known) for r in recordings)
     distinct = len(known) == len(streams) and len({r.id for r in recordings}) == len(recordings)
@@ -238,7 +243,7 @@ def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progr
     Raises:
         ForgottenError: if a person was removed from the data set meanwhile.
     """
-    stamp = current_stamp(folder)
+    stamp = IndexStamp.of(folder)
     built = build_index(folder, head or DatasetHead.read(folder), progress)
     if not built.unreadable:
         with built.dataset.generation.writing():
@@ -246,12 +251,12 @@ def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progr
     return built
 
 
-def write_index_files(dataset: Dataset, stamp: dict[str, Any] | None = None) -> None:
-    """Write the index files of ``dataset``; ``stamp`` is the `current_stamp` from before the raw files were read."""
-    stamp = stamp or current_stamp(dataset.path)
+def write_index_files(dataset: Dataset, stamp: IndexStamp | None = None) -> None:
+    """Write the index files of ``dataset``; ``stamp`` is the `IndexStamp` from before the raw files were read."""
+    stamp = stamp or IndexStamp.of(dataset.path)
     write_index(dataset.path / STREAMS_INDEX, dataset.streams, StreamInfo)
     write_index(dataset.path / RECORDINGS_INDEX, dataset.recordings, RecordingInfo)
-    write_stamp(dataset.path, stamp)
+    stamp.with_index(dataset.path).write(dataset.path)
 
 
 def change_head(folder: Path, change: Callable[[DatasetHead], DatasetHead]) -> DatasetHead:
@@ -264,12 +269,12 @@ def change_head(folder: Path, change: Callable[[DatasetHead], DatasetHead]) -> D
     """
     try:
         with Generation.of(folder).writing():
-            before, fresh = DatasetHead.read(folder), is_index_fresh(folder)
+            before, fresh = DatasetHead.read(folder), IndexStamp.read(folder) == IndexStamp.of(folder)
             head = change(before)
             if head != before:
                 write_file(folder / HEAD, head.to_toml())
                 if fresh and (head.layout, head.gestures) == (before.layout, before.gestures):
-                    write_stamp(folder, current_stamp(folder))
+                    IndexStamp.of(folder).write(folder)
     except OSError as cause:
         why = cause.strerror or str(cause)
         raise DatasetError(

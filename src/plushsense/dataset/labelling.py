@@ -1,6 +1,6 @@
 """Label stretches of streams by marks: practised gestures, handling of the toy, and rest; read and write them as CSV.
 
-`relabel` states by a mark that another gesture was made than a recording is named after.
+`relabel_recordings` states by a mark that another gesture was made than a recording is named after.
 
 Times are in seconds of the device clock since the first frame of the stream (`row_times_s`). Rows of located recordings
 need no label: they keep the gesture of the recording, whatever the marks say (`Dataset.stretches`).
@@ -14,11 +14,12 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, DatasetError, nearest
+from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.files import check_output_file, write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.marks import (
@@ -96,6 +97,13 @@ def find_streams(dataset: Dataset, pattern: str = "*") -> list[StreamInfo]:
     return [ids[identity] for identity in match_ids(pattern, ids, "stream")]
 
 
+def _one_stream(dataset: Dataset, pattern: str) -> StreamInfo:
+    (stream, *others) = find_streams(dataset, pattern)
+    if others:
+        raise DatasetError(f"'{pattern}' names {1 + len(others)} streams: give one.")
+    return stream
+
+
 def rows_between(stream: StreamInfo, seconds: NDArray[np.float64], start_s: float, stop_s: float) -> tuple[int, int]:
     """Return the rows of a stream from ``start_s`` to before ``stop_s``; ``seconds`` are its `row_times_s`.
 
@@ -157,7 +165,7 @@ def label_stretches(
     return new
 
 
-def relabel(
+def relabel_recordings(
     dataset: Dataset, recordings: Iterable[str], gesture: str, who: str | None = None, why: str = ""
 ) -> tuple[str, ...]:
     """State that ``gesture`` was made in ``recordings`` (ids); "" restores the recorded one.
@@ -171,17 +179,7 @@ def relabel(
         DatasetError: for a gesture that is not in the gesture set, or an unknown recording. No mark is written then.
     """
     known, standing = {r.id: r for r in dataset.recordings}, read_marks(dataset.path)
-    label = ""
-    if gesture:
-        found = dataset.gestures.find(gesture)
-        if found is None:
-            raise DatasetError(
-                f"'{dataset.head.name}' has no gesture '{gesture}': accepted are {', '.join(dataset.gestures.labels)}."
-                f"{nearest(gesture, dataset.gestures.labels)}",
-                reason="unknown_gesture",
-                gesture=gesture,
-            )
-        label = found.label
+    label = _gesture_label(dataset, gesture)
     marks = []
     for identity in recordings:
         (identity,) = match_ids(identity, known, "recording")
@@ -192,14 +190,26 @@ def relabel(
     return tuple(mark.recording for mark in marks)
 
 
-def unlabel(
-    dataset: Dataset, stream: StreamInfo, start: int = 0, stop: int = -1, who: str | None = None, why: str = ""
-) -> int:
-    """Remove the labels of rows of a stream, by default of all; return the number of stretches that change."""
-    standing = read_marks(dataset.path).get(stream.id, MarkState()).stretches
+def _gesture_label(dataset: Dataset, gesture: str) -> str:
+    """Return ``gesture`` as the data set writes it; "" stays."""
+    found = dataset.gestures.find(gesture) if gesture else None
+    if gesture and found is None:
+        raise DatasetError(
+            f"'{dataset.head.name}' has no gesture '{gesture}': accepted are {', '.join(dataset.gestures.labels)}."
+            f"{nearest(gesture, dataset.gestures.labels)}",
+            reason="unknown_gesture",
+            gesture=gesture,
+        )
+    return found.label if found is not None else ""
+
+
+def remove_labels(dataset: Dataset, stream: str, rows: tuple[int, int], who: str | None = None, why: str = "") -> int:
+    """Remove the labels of ``rows`` (start, stop) of a stream; return the number of stretches that change."""
+    start, stop = rows
+    standing = read_marks(dataset.path).get(stream, MarkState()).stretches
     changed = sum(s.outside(start, stop) != [s] for s in standing)
     if changed:
-        dataset.append_marks([Mark(stream.id, "unlabel", author_name(who), why, start=start, stop=stop)])
+        dataset.append_marks([Mark(stream, "unlabel", author_name(who), why, start=start, stop=stop)])
     return changed
 
 
@@ -219,9 +229,7 @@ def read_stretches(dataset: Dataset, path: str | os.PathLike[str]) -> list[Label
     times: dict[str, NDArray[np.float64]] = {}
     for line, cells in rows:
         try:
-            (stream, *others) = find_streams(dataset, cells["stream"])
-            if others:
-                raise DatasetError(f"'{cells['stream']}' names {1 + len(others)} streams: give one.")
+            stream = _one_stream(dataset, cells["stream"])
             if stream.id not in times:
                 times[stream.id] = row_times_s(dataset.read_stream(stream.id), dataset.layout.gap_ms)
             between = _seconds(cells["start_s"]), _seconds(cells["stop_s"])
@@ -260,63 +268,72 @@ def write_stretches(path: str | os.PathLike[str], stretches: Sequence[TimedStret
 
 @dataclass(frozen=True)
 class LabelResult:
-    """Result of `decide_labels`: the labelled stretches afterwards, and the numbers of new and changed ones."""
+    """Result of `decide_labels`.
+
+    Attributes:
+        stretches: the labelled stretches of all streams afterwards.
+        labelled, undone: numbers of stretches that were labelled anew, and of those whose labels were removed.
+        relabelled: ids of the recordings whose gesture changed.
+    """
 
     dataset: Dataset
     stretches: tuple[TimedStretch, ...]
     labelled: int = 0
     undone: int = 0
+    relabelled: tuple[str, ...] = ()
+
+
+Seconds: TypeAlias = tuple[float | None, float | None]
+"""Begin and end in seconds; None: the begin or the end of the stream."""
 
 
 def decide_labels(
     dataset: Dataset | str | os.PathLike[str],
-    stream: str = "*",
     *,
-    start_s: float | None = None,
-    stop_s: float | None = None,
-    label: str | None = None,
-    undo: bool = False,
+    label: Iterable[tuple[str, Seconds, str]] = (),
+    unlabel: Iterable[tuple[str, Seconds]] = (),
+    relabel: Iterable[tuple[str, str]] = (),
     file: str | os.PathLike[str] | None = None,
     who: str | None = None,
     why: str = "",
 ) -> LabelResult:
-    """Write marks for the given decision, and return the labelled stretches.
+    """Write marks for the given decisions, and return the labelled stretches.
 
     Args:
-        stream: id of a stream; to list stretches, also a pattern.
-        start_s, stop_s: stretch to label, or whose labels to remove (default: the beginning and the end).
-        label: handling, rest, or practice: and a gesture.
-        undo: whether to remove labels instead.
+        label: id of a stream, seconds, and what happens there: handling, rest, or practice: and a gesture.
+        unlabel: id of a stream, or a pattern, and the seconds whose labels are removed.
+        relabel: id of a recording, or a pattern, and the gesture that was made; "" restores the recorded one.
         file: a CSV file of stretches to label, see `read_stretches`.
         who, why: name (by default the login name) and reason for the marks.
 
     Raises:
-        ConfigError: for decisions that exclude each other, or lack a time.
-        DatasetError: for an unknown stream or label, or times outside the stream.
+        DatasetError: for an unknown stream, recording, label or gesture, or times outside the stream. No mark is
+            written then.
     """
-    if sum((label is not None, undo, file is not None)) > 1:
-        raise ConfigError("Label a stretch, import a file, or undo labels: one of these at a time.")
-    timed = start_s is not None or stop_s is not None
-    if (label is not None and (start_s is None or stop_s is None)) or (timed and label is None and not undo):
-        raise ConfigError("A stretch needs its two times and a label: --from S --to S --as handling.")
     dataset = as_dataset(dataset)
-    streams = find_streams(dataset, stream)
-    if (label is not None or timed) and len(streams) > 1:
-        raise ConfigError(f"One stream is labelled at a time, and '{stream}' names {len(streams)}: give an id.")
-    labelled = undone = 0
-    if file is not None:
-        labelled = len(label_stretches(dataset, read_stretches(dataset, file), who, why))
-    elif label is not None or timed:
-        seconds = row_times_s(dataset.read_stream(streams[0].id), dataset.layout.gap_ms)
-        first = 0.0 if start_s is None else start_s
-        last = float(seconds[-1]) if stop_s is None else stop_s
-        start, stop = rows_between(streams[0], seconds, first, last)
-        if undo:
-            undone = unlabel(dataset, streams[0], start, stop, who, why)
-        else:
-            new = [LabelledStretch(streams[0].id, start, stop, label or "")]
-            labelled = len(label_stretches(dataset, new, who, why))
-    elif undo:
-        undone = sum(unlabel(dataset, each, who=who, why=why) for each in streams)
+    new = read_stretches(dataset, file) if file is not None else []
+    new += [
+        LabelledStretch(*_rows_of(dataset, stream, times), check_label(dataset, name)) for stream, times, name in label
+    ]
+    removed = [_rows_of(dataset, s.id, times) for stream, times in unlabel for s in find_streams(dataset, stream)]
+    known = {r.id for r in dataset.recordings}
+    changes = [
+        (match_ids(pattern, known, "recording"), _gesture_label(dataset, gesture)) for pattern, gesture in relabel
+    ]
+    labelled = len(label_stretches(dataset, new, who, why))
+    undone = sum(remove_labels(dataset, stream, (start, stop), who, why) for stream, start, stop in removed)
+    changed = [i for ids, gesture in changes for i in relabel_recordings(dataset, ids, gesture, who, why)]
     again = as_dataset(dataset.path)
-    return LabelResult(again, tuple(timed_stretches(again, streams)), labelled, undone)
+    streams = again.streams if not again.layout.is_labelled else []
+    return LabelResult(again, tuple(timed_stretches(again, streams)), labelled, undone, tuple(changed))
+
+
+def _rows_of(dataset: Dataset, stream: str, times: Seconds) -> tuple[str, int, int]:
+    """Return the id of one stream and its rows between two times."""
+    found = _one_stream(dataset, stream)
+    seconds = row_times_s(dataset.read_stream(found.id), dataset.layout.gap_ms)
+    start_s, stop_s = times
+    start, stop = rows_between(
+        found, seconds, 0.0 if start_s is None else start_s, float(seconds[-1]) if stop_s is None else stop_s
+    )
+    return found.id, start, stop

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -60,6 +60,10 @@ class Mark:
     gesture: str = ""
 
 
+_TYPES = {key: int if key in ("start", "stop") else str for key in Mark.__dataclass_fields__}
+_REQUIRED = {"recording", "action", "who"}
+
+
 @dataclass(frozen=True)
 class LabelledStretch:
     """The rows from ``start`` to before ``stop`` of a stream, with the label of a `Mark`."""
@@ -87,8 +91,8 @@ class MarkState:
     """State of a recording or a stream after all its marks.
 
     ``accepted`` holds the checks whose findings are accepted; ``how`` is that of the current trim. ``stretches`` of a
-    stream are ordered and do not overlap. ``gesture`` is "" if it is the recorded one. ``trim_by`` and ``gesture_by``
-    name who decided last on the trim and on the gesture, also to undo them; "" if nobody did.
+    stream are ordered and do not overlap. ``gesture`` is "" if it is the recorded one. ``excluded_by``, ``trim_by`` and
+    ``gesture_by`` name who decided last on these, also to undo them; "" if nobody did.
     """
 
     excluded: bool = False
@@ -98,6 +102,7 @@ class MarkState:
     how: str = ""
     stretches: tuple[LabelledStretch, ...] = ()
     gesture: str = ""
+    excluded_by: str = field(default="", compare=False)
     trim_by: str = field(default="", compare=False)
     gesture_by: str = field(default="", compare=False)
 
@@ -261,17 +266,41 @@ def read_marks(folder: Path) -> dict[str, MarkState]:
 
     A line that is not JSON (cut off by a crash) is skipped; raise DatasetError for JSON that is not a valid mark.
     """
-    return MarksFollower(folder).states()
+    path = folder / MARKS
+    states: dict[str, MarkState] = {}
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return states
+    except OSError as cause:
+        raise _unreadable(path, cause) from None
+    for number, line in enumerate(lines, 1):
+        try:
+            table: Any = loads_json(line.decode("utf-8"))
+        except (ValueError, RecursionError):
+            continue
+        where = f"'{path}' line {number}"
+        # Checking each value strictly takes most of the time, and is only needed to say what is wrong.
+        plain = isinstance(table, dict) and _REQUIRED <= table.keys() <= _TYPES.keys()
+        plain = plain and all(type(value) is _TYPES[key] for key, value in table.items())
+        mark = Mark(**table) if plain else load_table(table, Mark, where, DatasetError, "marks_broken")
+        _refuse_contradictions(mark, where)
+        states[mark.recording] = apply_mark(states.get(mark.recording, MarkState()), mark)
+    return states
+
+
+def _unreadable(path: Path, cause: OSError) -> DatasetError:
+    why = cause.strerror or str(cause)
+    return DatasetError(f"'{path}' cannot be read: {why}.", reason="marks_not_read", why=why)
 
 
 class MarksFollower:
-    """Reader of the marks of a data set that reads only the lines appended since the last call. Not thread-safe."""
+    """Reader of the marks of a data set that reads the file again only if it changed. Not thread-safe."""
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / MARKS
-        self._states: dict[str, MarkState] = {}
+        self._folder = folder
         self._seen: tuple[int, int, int] | None = None
-        self._lines = self._bytes = 0
+        self._states: dict[str, MarkState] = {}
 
     @property
     def changed(self) -> bool:
@@ -281,69 +310,20 @@ class MarksFollower:
     def states(self) -> dict[str, MarkState]:
         """Return the state of each marked recording, like `read_marks`; a new dictionary if the file changed."""
         now = self._now()
-        if now == self._seen:
-            return self._last_states
-        if now is None:
-            # The file was removed by another program.
-            self._states, self._lines, self._bytes = {}, 0, 0
-            self._seen, self._last_states = now, {}
-            return self._last_states
-        try:
-            with self._path.open("rb") as file:
-                if not self._continues(file, now):
-                    self._states, self._lines, self._bytes = {}, 0, 0
-                file.seek(self._bytes)
-                *whole, rest = file.read().split(b"\n")
-        except OSError as cause:
-            raise DatasetError(
-                f"'{self._path}' cannot be read: {cause.strerror or cause}.",
-                reason="marks_not_read",
-                why=cause.strerror or str(cause),
-            ) from None
-        states = dict(self._states)
-        for line in whole:
-            self._take(line, self._lines + 1, states)
-            self._lines += 1
-            self._bytes += len(line) + 1
-        self._states = dict(states)
-        # A last line without a line end may be a complete mark or the beginning of one: do not keep its effect.
-        self._take(rest, self._lines + 1, states)
-        self._tail = whole[-1] if whole else self._tail
-        self._seen, self._last_states = now, states
-        return states
-
-    _last_states: dict[str, MarkState] = {}  # noqa: RUF012, RUF100
-    _tail = b""
+        if now != self._seen:
+            self._states = read_marks(self._folder)
+            self._seen = now
+        return self._states
 
     def _now(self) -> tuple[int, int, int] | None:
+        path = self._folder / MARKS
         try:
-            now = self._path.stat()
+            now = path.stat()
         except FileNotFoundError:
             return None
         except OSError as cause:
-            raise DatasetError(
-                f"'{self._path}' cannot be read: {cause.strerror or cause}.",
-                reason="marks_not_read",
-                why=cause.strerror or str(cause),
-            ) from None
+            raise _unreadable(path, cause) from None
         return now.st_ino, now.st_size, now.st_mtime_ns
-
-    def _continues(self, file: BinaryIO, now: tuple[int, int, int]) -> bool:
-        """Return whether the file is the one that was read before, possibly with more lines."""
-        if self._seen is None or now[0] != self._seen[0] or now[1] < self._bytes:
-            return False
-        file.seek(max(0, self._bytes - len(self._tail) - 1))
-        return self._bytes == 0 or file.read(len(self._tail) + 1) == self._tail + b"\n"
-
-    def _take(self, line: bytes, number: int, states: dict[str, MarkState]) -> None:
-        try:
-            table: Any = loads_json(line.decode("utf-8"))
-        except (ValueError, RecursionError):
-            return
-        where = f"'{self._path}' line {number}"
-        mark = load_table(table, Mark, where, DatasetError, "marks_broken")
-        _refuse_contradictions(mark, where)
-        states[mark.recording] = apply_mark(states.get(mark.recording, MarkState()), mark)
 
 
 def apply_mark(now: MarkState, mark: Mark) -> MarkState:
@@ -354,9 +334,9 @@ def apply_mark(now: MarkState, mark: Mark) -> MarkState:
         case "untrim":
             return replace(now, start=0, stop=-1, how="", trim_by=mark.who)
         case "exclude":
-            return replace(now, excluded=True)
+            return replace(now, excluded=True, excluded_by=mark.who)
         case "include":
-            return replace(now, excluded=False)
+            return replace(now, excluded=False, excluded_by=mark.who)
         case "relabel":
             return replace(now, gesture=mark.gesture, gesture_by=mark.who)
         case "accept":

@@ -44,6 +44,8 @@ HEAD = "dataset.toml"
 RECORDINGS = "recordings"
 STREAMS = "streams"
 PEOPLE = "subjects.csv"
+SAVED_SETS = ("train", "validation", "test")
+"""Sets of windows in an imported file; the session of a recording names those that it lay in."""
 UNKNOWN_SUBJECT = "unknown"
 FORGOTTEN = "forgotten.jsonl"
 UNDER_WAY = "forgetting.json"
@@ -613,3 +615,15 @@ def write_people(folder: Path, people: Iterable[PersonInfo]) -> None:
     for p in by_code:
         writer.writerow(p.more | {key: getattr(p, key) for key in PEOPLE_COLUMNS})
     write_file(folder / PEOPLE, out.getvalue())
+
+
+def sets_of_session(session: str, windows: int) -> list[str]:
+    """Return the set of each of the ``windows`` of a recording, as many as it had in the file; [] if it was in none."""
+    names, counts = session.split()[::2], session.split()[1::2]
+    if not names or not set(names) <= set(SAVED_SETS):
+        return []
+    if not counts:
+        return names * windows if len(names) == 1 else []
+    if len(counts) != len(names) or not all(n.isascii() and n.isdigit() and len(n) < 7 for n in counts):
+        return []
+    return [name for name, n in zip(names, counts, strict=True) for _ in range(int(n))]

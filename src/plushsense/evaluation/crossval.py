@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import NOBODY
-from plushsense.evaluation.leakage import audit_leakage
+from plushsense.evaluation.leakage import LeakageResult, audit_leakage
 from plushsense.evaluation.scores import (
     FoldRecord,
+    Metrics,
     Predictions,
+    Scores,
     compute_scores,
     gather_predictions,
     with_accuracy,
@@ -31,8 +33,12 @@ from plushsense.jobs.pool import JobsSpec, Report
 from plushsense.jobs.progress import JobProgress
 from plushsense.jobs.study import StudyPart, run_study
 from plushsense.scoring import metrics
+from plushsense.scoring.metrics import Summary
 from plushsense.scoring.splits import Fold, Index, Split, make_folds, purge
+from plushsense.training.spec import EpochProgress, EpochRow
 from plushsense.windows.cut import WindowSet
+
+SharedRows = Callable[[], Collection[tuple[str, str]]]
 
 # Part of every job's id: raise it when the meaning of a stored fold changes.
 _VERSION = 1
@@ -139,13 +145,10 @@ class FoldOutput:
     """
 
     probabilities: NDArray[np.float32]
-    history: list[dict[str, Any]] = field(default_factory=list)
+    history: list[EpochRow] = field(default_factory=list)
     seconds: float = 0.0
     best_epoch: int = 0
     deployed: NDArray[np.float32] | None = None
-
-
-EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
 
 class FitPredict(Protocol):
@@ -159,18 +162,22 @@ class FitPredict(Protocol):
 
 
 @dataclass
-class Evaluation:
+class EvaluationResult:
     """The outcome of `evaluate`.
 
-    ``to_dict`` is what reports and ``--json`` print.
+    ``leakage`` is the result of `audit_leakage`; ``int8`` compares the deployed networks with the float ones;
+    ``self_calibration`` is that of the windows; ``histories`` has the epochs of each fold.
     """
 
     split: Split
     context: str
     train_context: str
     seeds: list[int]
-    table: dict[str, Any]
-    histories: list[list[dict[str, Any]]]
+    scores: Scores
+    leakage: LeakageResult
+    self_calibration: str
+    int8: DeployedResult | None
+    histories: list[list[EpochRow]]
     predictions: Predictions
     predictions_path: Path | None = None
 
@@ -179,7 +186,7 @@ class Evaluation:
         self.predictions_path = write_predictions(path, self.predictions)
         return self.predictions_path
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         return {
             "split": self.split.text,
@@ -187,17 +194,19 @@ class Evaluation:
             "train_context": self.train_context,
             "leaky": self.split.leaky,
             "seeds": self.seeds,
-            **self.table,
+            **self.scores.to_json(),
+            "leakage": self.leakage.to_json(),
+            **({"self_calibration": self.self_calibration} if self.self_calibration else {}),
+            **({"int8": self.int8.to_json()} if self.int8 is not None else {}),
             "histories": self.histories,
             "predictions": None if self.predictions_path is None else str(self.predictions_path),
         }
 
     def __repr__(self) -> str:
-        accuracy = self.table["accuracy"]["mean"]
         leaky = ", leaky" if self.split.leaky else ""
         return (
-            f"Evaluation({self.split.text}{leaky}, trained on {self.train_context}, scored on {self.context}: "
-            f"accuracy {accuracy:.3f} over {len(self.predictions)} windows)"
+            f"EvaluationResult({self.split.text}{leaky}, trained on {self.train_context}, scored on {self.context}: "
+            f"accuracy {self.scores.mean('accuracy'):.3f} over {len(self.predictions)} windows)"
         )
 
 
@@ -213,9 +222,9 @@ def evaluate(
     cluster: str | None = None,
     seed: int = 0,
     validation: bool = True,
-    shared_rows: Collection[tuple[str, str]] = (),
+    shared_rows: SharedRows = tuple,
     progress: Callable[[JobProgress], None] | None = None,
-) -> Evaluation:
+) -> EvaluationResult:
     """Train and score a model on each fold of ``split``.
 
     Args:
@@ -228,7 +237,7 @@ def evaluate(
         cluster: address of a Ray cluster that runs the folds instead.
         seed: seed of the split.
         validation: whether to hold back windows for validation; without it they are trained on.
-        shared_rows: as for `audit_leakage`.
+        shared_rows: called for the argument ``shared_rows`` of `audit_leakage`.
         progress: called when a fold reports an epoch, with (epoch, epochs, row of the history) as its message, or is
             done.
 
@@ -250,6 +259,19 @@ def evaluate(
         spec=JobsSpec(workers, journal=journal, cluster=cluster),
         progress=progress,
     )
+    return _result(outcomes, folds, train_windows, score_windows, split, seed, shared_rows)
+
+
+def _result(
+    outcomes: Sequence[Result],
+    folds: Sequence[Fold],
+    train_windows: WindowSet,
+    score_windows: WindowSet,
+    split: Split,
+    seed: int,
+    shared_rows: SharedRows,
+) -> EvaluationResult:
+    """Score the outcomes of all folds."""
     records = [
         FoldRecord(
             fold.name,
@@ -262,20 +284,21 @@ def evaluate(
     ]
     tested = [(fold.name, fold.test) for fold in folds]
     predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
-    table = compute_scores(predictions, records, score_windows.affects, split.separates_people)
-    table["leakage"] = audit_leakage(train_windows, score_windows, folds, shared_rows).to_json()
-    if score_windows.self_calibration:
-        table["self_calibration"] = score_windows.self_calibration
+    scores = compute_scores(predictions, records, score_windows.affects, split.separates_people)
+    int8 = None
     if all("deployed" in outcome for outcome in outcomes):
         deployed = gather_predictions(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
         after = compute_scores(deployed, records, score_windows.affects, split.separates_people)
-        table["int8"] = compare_deployed(table, after, predictions, deployed)
-    return Evaluation(
+        int8 = compare_deployed(scores, after, predictions, deployed)
+    return EvaluationResult(
         split=split,
         context=context_of(score_windows),
         train_context=context_of(train_windows),
         seeds=[seed],
-        table=table,
+        scores=scores,
+        leakage=audit_leakage(train_windows, score_windows, folds, shared_rows()),
+        self_calibration=score_windows.self_calibration,
+        int8=int8,
         histories=[with_accuracy(outcome["history"], split.separates_people) for outcome in outcomes],
         predictions=predictions,
     )
@@ -291,7 +314,7 @@ class _FoldWork:
         train, score = shared
         score = train if score is None else score
 
-        def progress(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        def progress(epoch: int, epochs: int, row: EpochRow) -> None:
             report((epoch, epochs, row))
 
         out = self.fit_predict(train.take(task.train), train.take(task.validation), score.take(task.test), progress)
@@ -336,44 +359,91 @@ def fold_fingerprint(fold: Fold) -> str:
     return digest.hexdigest()
 
 
-def compare_deployed(
-    before: Mapping[str, Any], after: Mapping[str, Any], predictions: Predictions, deployed: Predictions
-) -> dict[str, Any]:
-    """Compare the deployed network with the float one, as plain values.
+@dataclass(frozen=True)
+class DeployedRow:
+    """The scores of a person or fold before and after deployment, by the keys of `column_metrics`.
+
+    ``loss`` is float minus 8 bits; ``agreement`` the share of the windows with the same class.
+    """
+
+    name: str
+    windows: int
+    before: Metrics
+    after: Metrics
+    loss: Metrics
+    agreement: float | None
+
+
+@dataclass(frozen=True)
+class DeployedResult:
+    """The comparison of the deployed networks with the float ones.
+
+    Attributes:
+        over: "subjects" or "folds", as of `Scores`.
+        means: summaries of the metrics in 8 bits; loss: those of the losses of the rows.
+        agreement: share of the windows with the same class.
+        probability_difference: mean over the windows of the largest difference of a probability.
+    """
+
+    over: str
+    means: dict[str, Summary]
+    loss: dict[str, Summary]
+    agreement: float | None
+    probability_difference: float | None
+    rows: tuple[DeployedRow, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        unit = "subject" if self.over == "subjects" else "fold"
+        rows = []
+        for row in self.rows:
+            scores: dict[str, float | None] = {}
+            for key, before in row.before.items():
+                scores |= {key: before, f"{key}_int8": row.after[key], f"{key}_loss": row.loss[key]}
+            rows.append({unit: row.name, "windows": row.windows, **scores, "agreement": row.agreement})
+        return {
+            **{key: found.to_json() for key, found in self.means.items()},
+            "loss": {key: found.to_json() for key, found in self.loss.items()},
+            "over": self.over,
+            "agreement": self.agreement,
+            "probability_difference": self.probability_difference,
+            "rows": rows,
+        }
+
+
+def compare_deployed(before: Scores, after: Scores, predictions: Predictions, deployed: Predictions) -> DeployedResult:
+    """Compare the deployed network with the float one.
 
     Args:
-        before, after: scores of the float and the deployed network, from `compute_scores`.
+        before, after: scores of the float and the deployed network.
         predictions, deployed: of the same windows, in the same order.
-
-    Returns:
-        the metrics of the deployed network by key; ``loss``, the difference float minus int8 of each person
-        (or fold, see ``over``) with the interval of its mean; ``agreement``, the share of the windows with the same
-        class; ``probability_difference``, the mean over the windows of the largest difference; ``rows``, one for each
-        person or fold.
     """
     same = predictions.predicted == deployed.predicted
-    people = before["over"] == "subjects"
-    name, of = ("subject", predictions.subject) if people else ("fold", predictions.fold)
-    keys = tuple(metrics.column_metrics())
+    people, keys = before.over == "subjects", tuple(metrics.column_metrics())
+    if people:
+        of, units = predictions.subject, [(row.subject, row.metrics) for row in before.subjects]
+        others = [row.metrics for row in after.subjects]
+    else:
+        of, units = predictions.fold, [(row.record.name, row.metrics) for row in before.folds]
+        others = [row.metrics for row in after.folds]
     rows = []
-    for one, other in zip(before[before["over"]], after[after["over"]], strict=True):
-        selected = of == one[name]
-        row = {name: one[name], "windows": int(selected.sum())}
-        for score in keys:
-            before_score, after_score = one[score], other[score]
-            loss = None if before_score is None or after_score is None else float(before_score - after_score)
-            row |= {score: before_score, f"{score}_int8": after_score, f"{score}_loss": loss}
-        rows.append(row | {"agreement": float(same[selected].mean()) if selected.any() else None})
+    for (name, one), other in zip(units, others, strict=True):
+        selected = of == name
+        agreement = float(same[selected].mean()) if selected.any() else None
+        loss = {key: _difference(one[key], other[key]) for key in keys}
+        one, other = ({key: each[key] for key in keys} for each in (one, other))
+        rows.append(DeployedRow(name, int(selected.sum()), one, other, loss, agreement))
     counted = predictions.subject != NOBODY if people else np.ones(len(same), dtype=np.bool_)
     differences = np.abs(predictions.probabilities - deployed.probabilities).max(axis=1)
-    return {
-        **{score: after[score] for score in keys},
-        "loss": {
-            score: metrics.summary([loss for row in rows if (loss := row[f"{score}_loss"]) is not None])
-            for score in keys
-        },
-        "over": before["over"],
-        "agreement": float(same[counted].mean()) if counted.any() else None,
-        "probability_difference": float(differences[counted].mean()) if counted.any() else None,
-        "rows": rows,
-    }
+    return DeployedResult(
+        over=before.over,
+        means={key: after.means[key] for key in keys},
+        loss={key: metrics.summary([at for row in rows if (at := row.loss[key]) is not None]) for key in keys},
+        agreement=float(same[counted].mean()) if counted.any() else None,
+        probability_difference=float(differences[counted].mean()) if counted.any() else None,
+        rows=tuple(rows),
+    )
+
+
+def _difference(before: float | None, after: float | None) -> float | None:
+    return None if before is None or after is None else float(before - after)

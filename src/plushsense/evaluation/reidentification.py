@@ -10,6 +10,7 @@ All people have equal weight: top-1 and top-5 are averaged over people, so that 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -89,7 +90,7 @@ class ReidentificationTrial:
 
 
 @dataclass(frozen=True)
-class Reidentified:
+class ReidentificationResult:
     """The results of a re-identification; ``skipped`` has the reason for each design that the data do not allow.
 
     ``gestures_of_one_person`` are gestures that only one person made, so that the label alone identifies the person.
@@ -109,7 +110,7 @@ class Reidentified:
         """Return the trial of a design and a program; None if it was skipped."""
         return next((t for t in self.trials if (t.design, t.sees) == (design, sees)), None)
 
-    def under(self, codes: Mapping[str, str], label: Callable[[str], str]) -> Reidentified:
+    def under(self, codes: Mapping[str, str], label: Callable[[str], str]) -> ReidentificationResult:
         """Return the results with the public code of each person (a code not in ``codes`` is kept) and gesture."""
 
         def renamed(shares: dict[str, float]) -> dict[str, float]:
@@ -129,7 +130,9 @@ class Reidentified:
         return {**vars(self), **lists}
 
 
-def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: Progress | None = None) -> Reidentified:
+def reidentify(
+    dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: Progress | None = None
+) -> ReidentificationResult:
     """Measure how well the people of a data set can be recognised by their recordings.
 
     Excluded recordings, those of `NOBODY` or unknown people, and people with a single recording are left out.
@@ -144,55 +147,65 @@ def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: P
         MissingExtraError: without scikit-learn.
     """
     forest = need("sklearn.ensemble", "baselines")
-    used = [r for r in dataset.used if r.subject not in (NOBODY, UNKNOWN_SUBJECT)]
-    counts: dict[str, int] = {}
-    for r in used:
-        counts[r.subject] = counts.get(r.subject, 0) + 1
-    used = [r for r in used if counts[r.subject] >= FEWEST_RECORDINGS]
-    if len({r.subject for r in used}) < 2:
-        raise BadInput(
-            f"Re-identification needs two people with at least {FEWEST_RECORDINGS} recordings each: leave it out with "
-            "--no-reidentification."
-        )
-    seen = [features(dataset.read(r), dataset.layout) for r in used]
-    whole = [i for i, s in enumerate(seen) if s is not None]
-    table = {name: np.stack([s[name] for s in seen if s is not None]) for name in SEES}
-    person = np.array([used[i].subject for i in whole])
-    gesture = np.array([used[i].gesture for i in whole])
-    session = np.array([used[i].session for i in whole])
-    rng = np.random.default_rng([seed, 0x1D])
-    at_random = np.zeros(len(person), dtype=np.int64)
-    for name in np.unique(person):
-        mine = rng.permutation(np.flatnonzero(person == name))
-        at_random[mine] = np.arange(len(mine)) % FOLDS
-    labels, which = np.unique(gesture, return_inverse=True)
-    turns = _turns(person, session)
-    groups = {"recordings": at_random, "gestures": np.asarray(which % FOLDS, dtype=np.int64), "sessions": turns}
+    seen = _read(dataset)
+    groups = {
+        "recordings": _at_random(seen.person, seed),
+        "gestures": np.asarray(np.unique(seen.gesture, return_inverse=True)[1] % FOLDS, dtype=np.int64),
+        "sessions": _turns(seen.person, seen.session),
+    }
     skipped = {}
-    if len(labels) < 2:
+    if len(np.unique(seen.gesture)) < 2:
         skipped["gestures"] = "there is only one gesture"
-    if not (turns >= 0).any():
+    if not (groups["sessions"] >= 0).any():
         skipped["sessions"] = "nobody has more than one session"
     plan = [(design, sees) for design, names in _PLAN if design not in skipped for sees in names]
     trials = []
     for done, (design, sees) in enumerate(plan):
         if progress is not None:
             progress(done, len(plan))
-        trials.append(_trial(design, sees, table[sees], person, groups[design], forest, seed, trees))
+        model = forest.ExtraTreesClassifier(trees, class_weight="balanced", random_state=seed, n_jobs=1)
+        ranked = _ranked(model, seen.features[sees], seen.person, groups[design], seed)
+        trials.append(_trial(design, sees, seen.person, ranked))
     if progress is not None:
         progress(len(plan), len(plan))
-    sessions = len(set(zip(person.tolist(), session.tolist(), strict=True)))
-    alone = [g for g in labels if len(np.unique(person[gesture == g])) == 1]
-    return Reidentified(
-        len(np.unique(person)),
-        len(person),
-        sessions,
-        tuple(trials),
-        skipped,
-        tuple(map(str, alone)),
-        seed,
-        trees,
-        dataset.head.simulated,
+    alone = [g for g in np.unique(seen.gesture) if len(np.unique(seen.person[seen.gesture == g])) == 1]
+    return ReidentificationResult(
+        people=len(np.unique(seen.person)),
+        recordings=len(seen.person),
+        sessions=len(set(zip(seen.person.tolist(), seen.session.tolist(), strict=True))),
+        trials=tuple(trials),
+        skipped=skipped,
+        gestures_of_one_person=tuple(map(str, alone)),
+        seed=seed,
+        trees=trees,
+        simulated=dataset.head.simulated,
+    )
+
+
+@dataclass(frozen=True)
+class _Recordings:
+    """The recordings that are used: features (n, F) for each program in `SEES`, and person, gesture, session (n,)."""
+
+    features: dict[str, Floats]
+    person: Texts
+    gesture: Texts
+    session: Texts
+
+
+def _read(dataset: Dataset) -> _Recordings:
+    """Read the recordings of people with at least `FEWEST_RECORDINGS`; those that are too short are left out."""
+    used = [r for r in dataset.used if r.subject not in (NOBODY, UNKNOWN_SUBJECT)]
+    counts = Counter(r.subject for r in used)
+    used = [r for r in used if counts[r.subject] >= FEWEST_RECORDINGS]
+    if len({r.subject for r in used}) < 2:
+        raise BadInput(
+            f"Re-identification needs two people with at least {FEWEST_RECORDINGS} recordings each: leave it out with "
+            "--no-reidentification."
+        )
+    seen = [(r, found) for r in used if (found := features(dataset.read(r), dataset.layout)) is not None]
+    return _Recordings(
+        {name: np.stack([found[name] for _, found in seen]) for name in SEES},
+        *(np.array([getattr(r, key) for r, _ in seen]) for key in ("subject", "gesture", "session")),
     )
 
 
@@ -224,6 +237,16 @@ def _clock(device_ms: NDArray[np.int64]) -> Floats:
     return np.array([steps.mean(), np.median(steps), steps.std(), float(np.mean(steps == np.median(steps)))])
 
 
+def _at_random(person: Texts, seed: int) -> NDArray[np.int64]:
+    """Divide each person's recordings among the folds at random, (n,)."""
+    rng = np.random.default_rng([seed, 0x1D])
+    group = np.zeros(len(person), dtype=np.int64)
+    for name in np.unique(person):
+        mine = rng.permutation(np.flatnonzero(person == name))
+        group[mine] = np.arange(len(mine)) % FOLDS
+    return group
+
+
 def _turns(person: Texts, session: Texts) -> NDArray[np.int64]:
     """Number each person's sessions and return that of each recording, (n,); −1 for people with one session."""
     group = np.full(len(person), -1, dtype=np.int64)
@@ -235,51 +258,53 @@ def _turns(person: Texts, session: Texts) -> NDArray[np.int64]:
     return group
 
 
-def _trial(
-    design: str, sees: str, x: Floats, person: Texts, group: NDArray[np.int64], forest: Any, seed: int, trees: int
-) -> ReidentificationTrial:
-    names, truth = np.unique(person, return_inverse=True)
-    top1 = np.full(len(truth), np.nan)
-    top5 = np.full(len(truth), np.nan)
-    named = np.full(len(truth), -1)
+def _ranked(model: Any, x: Floats, person: Texts, group: NDArray[np.int64], seed: int) -> NDArray[np.int64]:
+    """Return the likeliest five people of each recording, (n, 5), as indices of the sorted codes.
+
+    A group at a time is left out of the training. −1 stands for recordings that are not tested (group −1, or people
+    without training recordings, who cannot be named), and fills the row where fewer than five people are known.
+    """
+    _, truth = np.unique(person, return_inverse=True)
+    ranked = np.full((len(truth), 5), -1)
     rng = np.random.default_rng([seed, 0x7E])
     for turn in np.unique(group[group >= 0]):
-        test = np.flatnonzero(group == turn)
-        train = np.flatnonzero(group != turn)
-        # People without training recordings cannot be named.
+        test, train = np.flatnonzero(group == turn), np.flatnonzero(group != turn)
         test = test[np.isin(truth[test], truth[train])]
         if not len(test):
             continue
-        model = forest.ExtraTreesClassifier(trees, class_weight="balanced", random_state=seed, n_jobs=1)
         model.fit(x[train], truth[train])
         # Break ties at random (for example of people with equal clocks), and not in favour of the first code.
         chances = np.round(model.predict_proba(x[test]), 9)
-        likely = model.classes_[np.argsort(-(chances + 1e-10 * rng.random(chances.shape)), axis=1)]
-        named[test] = likely[:, 0]
-        hit = likely == truth[test][:, None]
-        top1[test] = hit[:, 0]
-        top5[test] = hit[:, :5].any(axis=1)
-    tested = np.isfinite(top1)
-    people = np.unique(truth[tested])
-    mine = {str(names[k]): float(top1[tested & (truth == k)].mean()) for k in people}
-    answers = {str(names[k]): named[tested] == k for k in people}
-    right = {p: float(top1[tested][at].mean()) if at.any() else 0.0 for p, at in answers.items()}
-    five = [float(top5[tested & (truth == k)].mean()) for k in people]
+        likely = model.classes_[np.argsort(-(chances + 1e-10 * rng.random(chances.shape)), axis=1)][:, :5]
+        ranked[test, : likely.shape[1]] = likely
+    return ranked
+
+
+def _trial(design: str, sees: str, person: Texts, ranked: NDArray[np.int64]) -> ReidentificationTrial:
+    """Score the people named for each recording, (n, 5)."""
+    names, truth = np.unique(person, return_inverse=True)
+    tested = ranked[:, 0] >= 0
+    named, truth = ranked[tested], truth[tested]
+    hit = named == truth[:, None]
+    people = np.unique(truth)
+    first = {str(names[k]): float(hit[truth == k, 0].mean()) for k in people}
+    five = [float(hit[truth == k].any(axis=1).mean()) for k in people]
+    answers = {str(names[k]): named[:, 0] == k for k in people}
     return ReidentificationTrial(
-        design,
-        sees,
-        len(names),
-        int(tested.sum()),
-        summary(list(mine.values())),
-        summary(five),
-        1.0 / len(names),
-        min(1.0, 5.0 / len(names)),
-        mine,
-        right,
+        design=design,
+        sees=sees,
+        people=len(names),
+        recordings=int(tested.sum()),
+        top1=summary(list(first.values())).to_json(),
+        top5=summary(five).to_json(),
+        chance=1.0 / len(names),
+        chance5=min(1.0, 5.0 / len(names)),
+        by_person=first,
+        precision={p: float(hit[at, 0].mean()) if at.any() else 0.0 for p, at in answers.items()},
     )
 
 
-def verdict(results: Reidentified) -> str:
+def verdict(results: ReidentificationResult) -> str:
     """Return a summary of the results as one Markdown paragraph.
 
     Raises:
@@ -289,7 +314,7 @@ def verdict(results: Reidentified) -> str:
     return " ".join(sentences.splitlines())
 
 
-def report(results: Reidentified, command: str) -> str:
+def report(results: ReidentificationResult, command: str) -> str:
     """Return the whole report in Markdown; ``command`` is the command line that it shows for repeating the test."""
     trial = results.find("recordings", "everything")
     by_person = None if trial is None else sorted(trial.by_person.items(), key=lambda item: (-item[1], item[0]))

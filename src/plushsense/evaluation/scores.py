@@ -7,10 +7,10 @@ Every figure of a result is one of these two, and is called *mean* or *pooled*.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,9 @@ from plushsense.core.errors import BadInput, need
 from plushsense.core.files import replacing_file
 from plushsense.core.gestures import NOBODY
 from plushsense.scoring import metrics
-from plushsense.scoring.metrics import Counts
+from plushsense.scoring.metrics import ClassResult, Counts, Summary
 from plushsense.scoring.splits import Index
+from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import WindowSet
 
 _P = "p_"
@@ -132,20 +133,26 @@ def read_predictions(path: str | Path) -> Predictions:
         raise BadInput(f"'{path}' holds no predictions of an evaluation ({cause}): evaluate again.") from None
 
 
-def with_accuracy(history: Iterable[Mapping[str, Any]], apart: bool) -> list[dict[str, Any]]:
+def with_accuracy(history: Iterable[EpochRow], apart: bool) -> list[EpochRow]:
     """Return the epochs of a training with ``accuracy``, that of validation as `compute_scores` counts it."""
-    key = "validation_accuracy_people" if apart else "validation_accuracy"
-    return [{**row, "accuracy": row.get(key)} for row in history]
+    return [
+        {**row, "accuracy": row.get("validation_accuracy_people") if apart else row.get("validation_accuracy")}
+        for row in history
+    ]
 
 
-def votes_by_person(predictions: Predictions) -> dict[str, dict[str, Any]]:
-    """Return for each person the scores of the vote over each recording's windows, and the number of recordings."""
+def votes_by_person(predictions: Predictions) -> dict[str, VoteResult]:
+    """Return for each person the scores of the vote over each recording's windows."""
     scorer = _Scorer(predictions)
     people = sorted(set(predictions.subject.tolist()) - {NOBODY})
     return {person: scorer.by_recording(predictions.subject == person) for person in people}
 
 
 Mask = NDArray[np.bool_]
+
+
+Metrics = dict[str, float | None]
+"""The scores of some windows by the keys of `METRICS`; None where one is not defined."""
 
 
 @dataclass(frozen=True)
@@ -159,10 +166,147 @@ class FoldRecord:
     seconds: float
 
 
+@dataclass(frozen=True)
+class FoldResult:
+    """The scores of a fold; with a split by people, without recordings of nobody."""
+
+    record: FoldRecord
+    metrics: Metrics
+    by_recording_accuracy: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        fold = self.record
+        train, validation, test = fold.windows
+        return {
+            "fold": fold.name,
+            "subject": fold.subjects[0] if len(fold.subjects) == 1 else None,
+            "subjects": list(fold.subjects),
+            "train_windows": train,
+            "validation_windows": validation,
+            "test_windows": test,
+            **self.metrics,
+            "by_recording_accuracy": self.by_recording_accuracy,
+            "epochs": fold.epochs,
+            "seconds": fold.seconds,
+        }
+
+
+@dataclass(frozen=True)
+class PersonResult:
+    """The scores of a person; ``metrics`` are those of `column_metrics`."""
+
+    subject: str
+    windows: int
+    recordings: int
+    metrics: Metrics
+    by_recording_accuracy: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "subject": self.subject,
+            "windows": self.windows,
+            "recordings": self.recordings,
+            **self.metrics,
+            "by_recording_accuracy": self.by_recording_accuracy,
+        }
+
+
+@dataclass(frozen=True)
+class VoteResult:
+    """The scores of the vote over each recording's windows."""
+
+    metrics: Metrics
+    recordings: int
+
+    def to_json(self) -> dict[str, float | int | None]:
+        """Return plain values, ready for JSON."""
+        return {**self.metrics, "recordings": self.recordings}
+
+
+class PartResult(NamedTuple):
+    """The accuracy on a part of the windows."""
+
+    windows: int
+    recordings: int
+    accuracy: float | None
+
+
+class ConfusionMatrix(NamedTuple):
+    """A confusion matrix (K, K) with the names of its classes."""
+
+    labels: tuple[str, ...]
+    counts: Counts
+
+    def to_json(self) -> dict[str, list[Any]]:
+        """Return plain values, ready for JSON."""
+        return {"labels": list(self.labels), "counts": self.counts.tolist()}
+
+
+@dataclass(frozen=True)
+class Scores:
+    """All scores of predictions.
+
+    Attributes:
+        means: the summary of each metric over the people, or with other splits over the folds.
+        macro_f1_all_classes: over the folds and all classes, including recordings of nobody, as in the paper.
+        with_rest: with a split by people and recordings of nobody, the metrics over folds with them, as in the paper.
+        over: what the means are over: "subjects" or "folds".
+        by_recording: scores of the votes of all counted recordings.
+        pooled: scores of all windows.
+        per_class, affects: the scores of each class, and its affect.
+        confusion, confusion_affect: of all windows, by class and by affect.
+        by_context: the accuracy by the kind of data before the windows.
+        nobody: the accuracy on recordings of nobody; None without them.
+    """
+
+    means: dict[str, Summary]
+    macro_f1_all_classes: Summary
+    with_rest: dict[str, Summary] | None
+    over: str
+    by_recording: VoteResult
+    pooled: Metrics
+    per_class: tuple[ClassResult, ...]
+    affects: tuple[str, ...]
+    confusion: ConfusionMatrix
+    confusion_affect: ConfusionMatrix
+    by_context: dict[str, PartResult]
+    nobody: PartResult | None
+    folds: tuple[FoldResult, ...]
+    subjects: tuple[PersonResult, ...]
+
+    def mean(self, metric: str) -> float | None:
+        """Return the mean of a metric over people or folds."""
+        return self.means[metric].mean
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        rest = self.with_rest
+        return {
+            **{name: found.to_json() for name, found in self.means.items()},
+            "macro_f1_all_classes": self.macro_f1_all_classes.to_json(),
+            "with_rest": None if rest is None else {name: found.to_json() for name, found in rest.items()},
+            "over": self.over,
+            "by_recording": self.by_recording.to_json(),
+            "pooled": self.pooled,
+            "per_class": [
+                {"label": row.label, "affect": affect, **row._asdict()}
+                for row, affect in zip(self.per_class, self.affects, strict=True)
+            ],
+            "confusion": self.confusion.to_json(),
+            "confusion_affect": self.confusion_affect.to_json(),
+            "by_context": {kind: part._asdict() for kind, part in self.by_context.items()},
+            "nobody": None if self.nobody is None else self.nobody._asdict(),
+            "folds": [fold.to_json() for fold in self.folds],
+            "subjects": [person.to_json() for person in self.subjects],
+        }
+
+
 def compute_scores(
-    predictions: Predictions, folds: list[FoldRecord], affects: tuple[str, ...], apart: bool
-) -> dict[str, Any]:
-    """Compute all scores as plain values; those that cannot be computed are None.
+    predictions: Predictions, folds: Sequence[FoldRecord], affects: tuple[str, ...], apart: bool
+) -> Scores:
+    """Compute all scores.
 
     Args:
         affects: the affect of each class.
@@ -179,31 +323,29 @@ def compute_scores(
     whole = [scorer.counts(m) for m in of_fold]
     all_classes = metrics.summary([metrics.macro_f1(c, all_classes=True) for c in whole])
     everything = scorer.counts(np.ones(len(people), dtype=np.bool_))
-    affect_names, by_affect = metrics.grouped(everything, affects)
-    return {
-        **{name: metrics.summary([f[name] for f in parts]) for name in metrics.METRICS},
-        "macro_f1_all_classes": all_classes,
-        "with_rest": None
-        if people.all() or not apart
-        else {
+    with_rest = None
+    if apart and not people.all():
+        with_rest = {
             "accuracy": metrics.summary([metrics.METRICS["accuracy"].function(c) for c in whole]),
             "macro_recall": metrics.summary([metrics.macro_recall(c, all_classes=True) for c in whole]),
             "macro_f1": all_classes,
-        },
-        "over": "subjects" if apart else "folds",
-        "by_recording": scorer.by_recording(counted),
-        "pooled": _plain(metrics.scores_of(everything)),
-        "per_class": [
-            {"label": row["label"], "affect": affect, **row}
-            for row, affect in zip(metrics.class_rows(everything, predictions.labels), affects, strict=True)
-        ],
-        "confusion": {"labels": list(predictions.labels), "counts": everything.tolist()},
-        "confusion_affect": {"labels": list(affect_names), "counts": by_affect.tolist()},
-        "by_context": scorer.by_context(counted),
-        "nobody": None if people.all() else scorer.size(~people) | {"accuracy": scorer.figures(~people)["accuracy"]},
-        "folds": [_fold(fold, scorer, mask & counted) for fold, mask in zip(folds, of_fold, strict=True)],
-        "subjects": [_person(name, scorer, m) for name, m in zip(people_codes, of_person, strict=True)],
-    }
+        }
+    return Scores(
+        means={name: metrics.summary([f[name] for f in parts]) for name in metrics.METRICS},
+        macro_f1_all_classes=all_classes,
+        with_rest=with_rest,
+        over="subjects" if apart else "folds",
+        by_recording=scorer.by_recording(counted),
+        pooled=_plain(metrics.scores_of(everything)),
+        per_class=tuple(metrics.class_results(everything, predictions.labels)),
+        affects=affects,
+        confusion=ConfusionMatrix(predictions.labels, everything),
+        confusion_affect=ConfusionMatrix(*metrics.grouped(everything, affects)),
+        by_context=scorer.by_context(counted),
+        nobody=None if people.all() else scorer.part(~people),
+        folds=tuple(scorer.fold(fold, mask & counted) for fold, mask in zip(folds, of_fold, strict=True)),
+        subjects=tuple(scorer.person(name, mask) for name, mask in zip(people_codes, of_person, strict=True)),
+    )
 
 
 class _Scorer:
@@ -221,51 +363,31 @@ class _Scorer:
     def figures(self, mask: Mask) -> dict[str, float]:
         return metrics.scores_of(self.counts(mask))
 
-    def size(self, mask: Mask) -> dict[str, int]:
-        return {"windows": int(mask.sum()), "recordings": len(np.unique(self._recording[mask]))}
+    def part(self, mask: Mask) -> PartResult:
+        accuracy = _plain(self.figures(mask))["accuracy"]
+        return PartResult(int(mask.sum()), len(np.unique(self._recording[mask])), accuracy)
 
-    def by_recording(self, mask: Mask) -> dict[str, Any]:
-        """Return the scores of the vote over each recording's windows."""
+    def by_recording(self, mask: Mask) -> VoteResult:
         recording = self._recording[mask]
         ids, predicted = metrics.vote(self._all.probabilities[mask], recording)
         _, first = np.unique(recording, return_index=True)
         figures = metrics.scores_of(metrics.confusion(self._all.truth[mask][first], predicted, self._classes))
-        return _plain(figures) | {"recordings": len(ids)}
+        return VoteResult(_plain(figures), len(ids))
 
-    def by_context(self, mask: Mask) -> dict[str, Any]:
-        table = {}
-        for kind in ("stream", "inside", "loop", "rows"):
-            selected = mask & (self._all.context == kind)
-            if selected.any():
-                table[kind] = self.size(selected) | _plain({"accuracy": self.figures(selected)["accuracy"]})
-        return table
+    def by_context(self, mask: Mask) -> dict[str, PartResult]:
+        kinds = ("stream", "inside", "loop", "rows")
+        masks = {kind: mask & (self._all.context == kind) for kind in kinds}
+        return {kind: self.part(selected) for kind, selected in masks.items() if selected.any()}
+
+    def fold(self, record: FoldRecord, mask: Mask) -> FoldResult:
+        return FoldResult(record, _plain(self.figures(mask)), self.by_recording(mask).metrics["accuracy"])
+
+    def person(self, name: str, mask: Mask) -> PersonResult:
+        part, figures = self.part(mask), _plain(self.figures(mask))
+        shown = {key: figures[key] for key in metrics.column_metrics()}
+        return PersonResult(name, part.windows, part.recordings, shown, self.by_recording(mask).metrics["accuracy"])
 
 
-def _plain(figures: dict[str, float]) -> dict[str, float | None]:
+def _plain(figures: dict[str, float]) -> Metrics:
     """Replace NaN, which JSON cannot represent, by None."""
     return {name: float(value) if np.isfinite(value) else None for name, value in figures.items()}
-
-
-def _fold(fold: FoldRecord, scorer: _Scorer, mask: Mask) -> dict[str, Any]:
-    return {
-        "fold": fold.name,
-        "subject": fold.subjects[0] if len(fold.subjects) == 1 else None,
-        "subjects": list(fold.subjects),
-        "train_windows": fold.windows[0],
-        "validation_windows": fold.windows[1],
-        "test_windows": fold.windows[2],
-        **_plain(scorer.figures(mask)),
-        "by_recording_accuracy": scorer.by_recording(mask)["accuracy"],
-        "epochs": fold.epochs,
-        "seconds": fold.seconds,
-    }
-
-
-def _person(name: str, scorer: _Scorer, mask: Mask) -> dict[str, Any]:
-    figures = _plain(scorer.figures(mask))
-    return {
-        "subject": name,
-        **scorer.size(mask),
-        **{key: figures[key] for key in metrics.column_metrics()},
-        "by_recording_accuracy": scorer.by_recording(mask)["accuracy"],
-    }

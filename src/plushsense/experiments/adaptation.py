@@ -7,7 +7,7 @@ import itertools
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -24,6 +24,9 @@ from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration, integer_network, integer_probabilities, refuse_undeployable
 from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
+from plushsense.jobs.journal import Result
+from plushsense.jobs.pool import JobsSpec, Report
+from plushsense.jobs.study import Progress, StudyPart, StudyResults, run_study
 from plushsense.live.adaptation import (
     Personal,
     PersonalSpec,
@@ -37,8 +40,8 @@ from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, prepare, windows_for
-from plushsense.workflow.reporting import keep_bundle
+from plushsense.workflow.preparation import Run, Warn, prepare, windows_for
+from plushsense.workflow.reporting import journal_of, keep_bundle
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
 """Returns the probabilities (N, K) of windows."""
@@ -61,73 +64,186 @@ class HeldOutPerson:
     adapt: Callable[[WindowSet], Predictors | None]
 
 
-def score_adaptation(
-    windows: WindowSet,
-    people: Iterable[HeldOutPerson],
-    times: Mapping[str, int],
-    *,
-    use: int = 2,
-    random: int = 0,
-    seed: int = 0,
-    progress: Callable[[str], None] | None = None,
-) -> dict[str, Any]:
-    """Compare the scores of people before and after adaptation.
+@dataclass(frozen=True)
+class ChoiceSpec:
+    """Which recordings a network is adapted to.
+
+    The choices are all sets of ``use`` numbers, the same for all gestures (10 of 5 recordings), where the recordings of
+    a gesture are numbered by time; the first choice is the first recordings of each gesture. ``random`` further choices
+    are drawn for each gesture on its own, with ``seed``.
+    """
+
+    use: int = 2
+    random: int = 0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class PersonGain:
+    """What adaptation changed for one person: means over the ``choices``.
+
+    ``right_change`` counts correct recordings, after minus before; ``choices_worse`` the choices that lost more than
+    one. ``scores`` has for accuracy and macro-F1 the value ``before`` and ``after``, and the gain of the ``first``
+    choice.
+    """
+
+    subject: str
+    choices: int
+    recordings: float
+    right_change: float
+    right_change_worst: int
+    choices_worse: int
+    scores: Mapping[str, Mapping[str, float]]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, the scores as keys such as ``accuracy_before``."""
+        row = {name: value for name, value in vars(self).items() if name != "scores"}
+        return row | {f"{score}_{when}": value for score, at in self.scores.items() for when, value in at.items()}
+
+
+@dataclass(frozen=True)
+class PersonTrial:
+    """The outcome of all choices for one person.
+
+    Attributes:
+        refused: of each choice, whether the network stayed as it was.
+        gains: by engine.
+        agreement: of each choice, the share of the windows on which the engines agree, before and after.
+    """
+
+    refused: tuple[bool, ...]
+    gains: Mapping[str, PersonGain]
+    agreement: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def from_journal(cls, row: Mapping[str, Any]) -> PersonTrial:
+        """Restore what ``asdict`` returned."""
+        gains = {name: PersonGain(**gain) for name, gain in row["gains"].items()}
+        return cls(tuple(row["refused"]), gains, tuple((one, other) for one, other in row["agreement"]))
+
+
+@dataclass(frozen=True)
+class EngineGains:
+    """The gains of one engine over people.
+
+    ``scores``: of accuracy and macro-F1 ``before``, ``after``, ``gain``, and ``first``, the gain of the first choice.
+    ``right``: correct recordings after minus before: ``mean``, ``worst_mean`` of a person, ``worst`` of a choice,
+    ``worse_people`` (less by more than one on average), ``worse_choices`` (share of choices).
+    """
+
+    scores: Mapping[str, Mapping[str, Any]]
+    right: Mapping[str, float]
+    people: tuple[PersonGain, ...]
+
+    @classmethod
+    def over(cls, people: Sequence[PersonGain]) -> EngineGains:
+        scores = {}
+        for score in _SCORES:
+            before, after, first = (
+                np.array([row.scores[score][when] for row in people]) for when in ("before", "after", "first")
+            )
+            scores[score] = {
+                "before": metrics.summary(before).to_json(),
+                "after": metrics.summary(after).to_json(),
+                "gain": metrics.summary(after - before).to_json(),
+                "first": metrics.summary(first).to_json(),
+            }
+        changes = [row.right_change for row in people]
+        right = {
+            "mean": float(np.mean(changes)),
+            "worst_mean": min(changes),
+            "worst": min(row.right_change_worst for row in people),
+            "worse_people": sum(change < -1 for change in changes),
+            "worse_choices": sum(row.choices_worse for row in people) / sum(row.choices for row in people),
+        }
+        return cls(scores, right, tuple(people))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {**self.scores, "right": dict(self.right), "people": [row.to_json() for row in self.people]}
+
+
+@dataclass(frozen=True)
+class AdaptationScores:
+    """Scores of people before and after adaptation.
+
+    Attributes:
+        choices: number of them in all; ``refused``: share of them in which the network stayed as it was.
+        agreement: share of the test windows on which the engines agree, before and after; None with one engine.
+    """
+
+    context: str
+    choice: ChoiceSpec
+    choices: int
+    refused: float
+    engines: Mapping[str, EngineGains]
+    agreement: Mapping[str, float] | None
+
+    @classmethod
+    def over(cls, context: str, choice: ChoiceSpec, trials: Sequence[PersonTrial]) -> AdaptationScores:
+        """Return the scores over the trials of all people.
+
+        Raises:
+            BadInput: when nobody has more than ``choice.use`` recordings of a gesture.
+        """
+        names = list(dict.fromkeys(name for trial in trials for name in trial.gains))
+        if not names:
+            raise BadInput(
+                f"Nobody has more than {choice.use} recordings of a gesture (--use), so none is left to test on."
+            )
+        refused = [one for trial in trials for one in trial.refused]
+        same = [pair for trial in trials for pair in trial.agreement]
+        return cls(
+            context,
+            choice,
+            len(refused),
+            float(np.mean(refused)),
+            {name: EngineGains.over([t.gains[name] for t in trials if name in t.gains]) for name in names},
+            {when: float(np.mean([pair[i] for pair in same])) for i, when in enumerate(("before", "after"))}
+            if same
+            else None,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "context": self.context,
+            "use": self.choice.use,
+            "random": self.choice.random,
+            "choices": self.choices,
+            "refused": self.refused,
+            "engines": {name: gains.to_json() for name, gains in self.engines.items()},
+            "agreement": self.agreement,
+        }
+
+
+def try_adapting(
+    windows: WindowSet, person: HeldOutPerson, times: Mapping[str, int], choice: ChoiceSpec
+) -> PersonTrial:
+    """Adapt to each choice of one person's recordings, and compare the scores on the others before and after.
 
     Args:
         windows: of everybody.
-        times: when each recording was made, by its id: recordings of a gesture are numbered in this order.
-        use: recordings of each gesture to adapt to. The choices are all sets of ``use`` numbers, the same for all
-            gestures (10 of 5 recordings); the first choice is the first recordings of each gesture.
-        random: further choices, drawn for each gesture on its own.
-        progress: called with each person who is done.
-
-    Returns:
-        ``context``, ``use``, ``random``, ``choices`` in all, ``refused`` (share of the choices in which the bundle
-        stayed as it was); ``engines``: of each ``accuracy`` and ``macro_f1`` with ``before``, ``after`` and ``gain``
-        (mean, sd, ci95 over people), ``first`` (the same gain for the first choice), ``right`` (correct recordings
-        after minus before: ``mean``, ``worst_mean`` of a person, ``worst`` of a choice, ``worse_people``: less by
-        more than one on average, ``worse_choices``: share of choices) and ``people``, a row each; ``agreement``, the
-        share of the test windows on which the engines agree, before and after (None with one engine).
-
-    Raises:
-        BadInput: when nobody has more than ``use`` recordings of a gesture.
+        times: when each recording was made, by its id.
     """
-    rows: dict[str, list[dict[str, Any]]] = {}
-    same: list[tuple[float, float]] = []
+    mine = windows.take(np.flatnonzero(windows.subject == person.subject))
+    tried: dict[str, list[_Change]] = {name: [] for name in person.predictors}
     refused: list[bool] = []
-    for person in people:
-        mine = windows.take(np.flatnonzero(windows.subject == person.subject))
-        tried: dict[str, list[_Change]] = {name: [] for name in person.predictors}
-        for chosen in _choices(mine, times, use, random, seed):
-            own, test = _divide(mine, chosen)
-            if not len(own) or not len(test):
-                continue
-            adapted = person.adapt(own)
-            refused.append(adapted is None)
-            before = {name: predict(test) for name, predict in person.predictors.items()}
-            after = before if adapted is None else {name: predict(test) for name, predict in adapted.items()}
-            for name in before:
-                tried[name].append(_Change.of(test, before[name], after[name]))
-            if len(before) > 1:
-                same.append((_agreement(list(before.values())), _agreement(list(after.values()))))
-        for name, changes in tried.items():
-            if changes:
-                rows.setdefault(name, []).append(_row(person.subject, changes))
-        if progress is not None:
-            progress(person.subject)
-    if not rows:
-        raise BadInput(f"Nobody has more than {use} recordings of a gesture (--use), so none is left to test on.")
-    return {
-        "context": context_of(windows),
-        "use": use,
-        "random": random,
-        "choices": len(refused),
-        "refused": float(np.mean(refused)),
-        "engines": {name: _summary(people) for name, people in rows.items()},
-        "agreement": {when: float(np.mean([each[i] for each in same])) for i, when in enumerate(("before", "after"))}
-        if same
-        else None,
-    }
+    same: list[tuple[float, float]] = []
+    for chosen in _choices(mine, times, choice):
+        own, test = _divide(mine, chosen)
+        if not len(own) or not len(test):
+            continue
+        adapted = person.adapt(own)
+        refused.append(adapted is None)
+        before = {name: predict(test) for name, predict in person.predictors.items()}
+        after = before if adapted is None else {name: predict(test) for name, predict in adapted.items()}
+        for name in before:
+            tried[name].append(_Change.of(test, before[name], after[name]))
+        if len(before) > 1:
+            same.append((_agreement(list(before.values())), _agreement(list(after.values()))))
+    gains = {name: _gain(person.subject, changes) for name, changes in tried.items() if changes}
+    return PersonTrial(tuple(refused), gains, tuple(same))
 
 
 @dataclass(frozen=True)
@@ -155,7 +271,7 @@ class _Change:
         )
 
 
-def _choices(windows: WindowSet, times: Mapping[str, int], use: int, random: int, seed: int) -> Iterator[set[int]]:
+def _choices(windows: WindowSet, times: Mapping[str, int], choice: ChoiceSpec) -> Iterator[set[int]]:
     """Yield the recordings to adapt to, as numbers of ``windows.recording``."""
     by_class = []
     for k in np.unique(windows.y):
@@ -164,11 +280,11 @@ def _choices(windows: WindowSet, times: Mapping[str, int], use: int, random: int
             key=lambda r: (times.get(windows.recording_ids[r], 0), windows.recording_ids[r]),
         )
         by_class.append(mine)
-    for numbers in itertools.combinations(range(max(map(len, by_class), default=0)), use):
+    for numbers in itertools.combinations(range(max(map(len, by_class), default=0)), choice.use):
         yield {mine[n] for mine in by_class for n in numbers if n < len(mine)}
-    draw = np.random.default_rng(seed)
-    for _ in range(random):
-        yield {int(r) for mine in by_class for r in draw.permutation(mine)[:use]}
+    draw = np.random.default_rng(choice.seed)
+    for _ in range(choice.random):
+        yield {int(r) for mine in by_class for r in draw.permutation(mine)[: choice.use]}
 
 
 def _divide(windows: WindowSet, chosen: set[int]) -> tuple[WindowSet, WindowSet]:
@@ -184,44 +300,22 @@ def _agreement(probabilities: list[NDArray[np.floating[Any]]]) -> float:
     return float((one == other).mean())
 
 
-def _row(subject: str, changes: list[_Change]) -> dict[str, Any]:
+def _gain(subject: str, changes: list[_Change]) -> PersonGain:
     difference = [c.right[1] - c.right[0] for c in changes]
-    row: dict[str, Any] = {
-        "subject": subject,
-        "choices": len(changes),
-        "recordings": float(np.mean([c.recordings for c in changes])),
-        "right_change": float(np.mean(difference)),
-        "right_change_worst": min(difference),
-        "choices_worse": sum(d < -1 for d in difference),
-    }
+    scores = {}
     for score in _SCORES:
         pairs = np.array([getattr(c, score) for c in changes])
-        row |= {f"{score}_before": float(pairs[:, 0].mean()), f"{score}_after": float(pairs[:, 1].mean())}
-        row[f"{score}_first"] = float(pairs[0, 1] - pairs[0, 0])
-    return row
-
-
-def _summary(people: list[dict[str, Any]]) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for score in _SCORES:
-        before, after, first = (
-            np.array([row[f"{score}_{when}"] for row in people]) for when in ("before", "after", "first")
-        )
-        out[score] = {
-            "before": metrics.summary(before),
-            "after": metrics.summary(after),
-            "gain": metrics.summary(after - before),
-            "first": metrics.summary(first),
-        }
-    changes = [row["right_change"] for row in people]
-    out["right"] = {
-        "mean": float(np.mean(changes)),
-        "worst_mean": min(changes),
-        "worst": min(row["right_change_worst"] for row in people),
-        "worse_people": sum(change < -1 for change in changes),
-        "worse_choices": sum(row["choices_worse"] for row in people) / sum(row["choices"] for row in people),
-    }
-    return out | {"people": people}
+        first = float(pairs[0, 1] - pairs[0, 0])
+        scores[score] = {"before": float(pairs[:, 0].mean()), "after": float(pairs[:, 1].mean()), "first": first}
+    return PersonGain(
+        subject,
+        len(changes),
+        float(np.mean([c.recordings for c in changes])),
+        float(np.mean(difference)),
+        min(difference),
+        sum(d < -1 for d in difference),
+        scores,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +415,7 @@ def adapt(
     adapting, test = windows, None
     if use is not None:
         everything = set(windows.recording.tolist())
-        adapting, test = _divide(windows, next(_choices(windows, times, use, 0, 0), everything))
+        adapting, test = _divide(windows, next(_choices(windows, times, ChoiceSpec(use)), everything))
         if not len(test):
             raise BadInput(
                 f"No recording of {person} is left to test on: {use} of each gesture are used to adapt; use fewer."
@@ -418,6 +512,25 @@ def _predictors(bundle: Bundle, int8: bool) -> dict[str, Predictor]:
     return predictors
 
 
+@dataclass(frozen=True)
+class AdaptingResult:
+    """The result of `evaluate_adapting`."""
+
+    split: str
+    simulated: bool
+    spec: PersonalSpec
+    scores: AdaptationScores
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "split": self.split,
+            "simulated": self.simulated,
+            "spec": asdict(self.spec),
+            **self.scores.to_json(),
+        }
+
+
 def evaluate_adapting(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
@@ -427,26 +540,21 @@ def evaluate_adapting(
     random: int = 0,
     int8: bool = False,
     spec: PersonalSpec | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
     warn: Warn = python_warning,
     **settings: Any,
-) -> dict[str, Any]:
+) -> AdaptingResult:
     """Measure how much adaptation helps people left out: one network for each fold, adapted to each of its people.
 
-    The networks are kept in the data set's ``cache`` folder. Adaptation is not tuned here: each person's strength, and
-    whether to adapt at all, follow from the recordings that the network is adapted to.
+    Networks and finished folds are kept in the data set's ``cache`` folder. Adaptation is not tuned here: each person's
+    strength, and whether to adapt at all, follow from the recordings that the network is adapted to.
 
     Args:
-        config, settings: as for `plushsense.train`.
-        use, random: as for `score_adaptation`.
+        config, settings: as for `plushsense.train`; also ``workers``.
+        use, random: as for `ChoiceSpec`.
         int8: also score the deployed networks, before and after.
-        progress: called with a sentence on each finished training or person.
-
-    Returns:
-        What `score_adaptation` returns, and ``split``, ``simulated``, ``spec``.
     """
     run = prepare(dataset, config or from_settings(**settings), warn)
-    dataset, gestures, arch = run.dataset, run.gestures, run.network
     spec = spec or PersonalSpec()
     if use < spec.least or random < 0:
         raise ConfigError(f"--use {use}, --choices {random}: accepted are {spec.least} and more, 0 and more.")
@@ -454,60 +562,100 @@ def evaluate_adapting(
     if not division.separates_people:
         raise ConfigError(f"The split {split} does not keep people apart: use leave-one-subject-out or by-subject:5.")
     if int8:
-        refuse_undeployable(arch)
-    windows = windows_for(dataset, arch, run.windows, gestures, warn)
-    folds = fold_windows(windows, windows, division, run.evaluation.seed)
-    key = {"windows": windows_fingerprint(windows), "arch": arch.to_dict(), "layout": dataset.layout.to_dict()}
-    tell = progress or (lambda _: None)
+        refuse_undeployable(run.network)
+    windows = windows_for(run.dataset, run.network, run.windows, run.gestures, warn)
+    choice = ChoiceSpec(use, random, run.evaluation.seed)
+    work = _FoldWork(run, choice, spec, int8)
+    context = context_of(windows)
 
-    def bundle_of(fold: Fold) -> Bundle:
-        made = json.dumps({**key, "fold": fold_fingerprint(fold), "training": run.training.key()}, sort_keys=True)
-        path = dataset.path / CACHE / "adapting" / f"{hashlib.sha256(made.encode()).hexdigest()[:32]}.plush"
+    def summarise(study: StudyResults) -> AdaptationScores:
+        trials = [PersonTrial.from_journal(row) for result in study.results for row in result["people"]]
+        return AdaptationScores.over(context, choice, trials)
+
+    scores = run_study(
+        [
+            StudyPart(fold.name, {"fold": fold_fingerprint(fold)}, fold)
+            for fold in fold_windows(windows, windows, division, run.evaluation.seed)
+        ],
+        work,
+        summarise,
+        key=work.key(windows),
+        shared=windows,
+        spec=JobsSpec(run.evaluation.processes, journal=journal_of(run.dataset, _FOLDER)),
+        progress=progress,
+    )
+    return AdaptingResult(division.text, run.dataset.head.simulated, spec, scores)
+
+
+# Part of every job's id: increase it when the meaning of a stored fold changes.
+_VERSION = 1
+_FOLDER = "adapting"
+
+
+@dataclass(frozen=True)
+class _FoldWork:
+    """The work of one fold: train its network, or load it, and adapt it to each person who was left out."""
+
+    run: Run
+    choice: ChoiceSpec
+    spec: PersonalSpec
+    int8: bool
+
+    def key(self, windows: WindowSet) -> dict[str, Any]:
+        """Return what the result of every fold depends on."""
+        times = sorted((r.id, r.epoch_ms) for r in self.run.dataset.recordings)
+        tried = {"choice": vars(self.choice), "spec": asdict(self.spec), "int8": self.int8, "times": times}
+        return {"version": _VERSION, **self._network_key(windows), "tried": tried}
+
+    def _network_key(self, windows: WindowSet) -> dict[str, Any]:
+        return {
+            "windows": windows_fingerprint(windows),
+            "arch": self.run.network.to_dict(),
+            "layout": self.run.dataset.layout.to_dict(),
+            "training": self.run.training.key(),
+        }
+
+    def __call__(self, windows: WindowSet, task: Fold, report: Report, /) -> Result:
+        bundle = self._bundle_of(windows, task, report)
+        predictors = _predictors(bundle, self.int8)
+        times = {r.id: r.epoch_ms for r in self.run.dataset.recordings}
+        people = [
+            HeldOutPerson(who, predictors, partial(_adapt_to, bundle, who, self.spec, self.int8))
+            for who in task.subjects
+        ]
+        return {"people": [asdict(try_adapting(windows, person, times, self.choice)) for person in people]}
+
+    def _bundle_of(self, windows: WindowSet, fold: Fold, report: Report) -> Bundle:
+        """Return the fold's network from the cache, or train it."""
+        run, dataset, arch = self.run, self.run.dataset, self.run.network
+        made = json.dumps({**self._network_key(windows), "fold": fold_fingerprint(fold)}, sort_keys=True)
+        path = dataset.path / CACHE / _FOLDER / f"{hashlib.sha256(made.encode()).hexdigest()[:32]}.plush"
         if path.exists():
             return Bundle.load(path)
         from plushsense.training.fit import fit
 
         mine = windows.take(fold.train)
-        fitted = fit(mine, windows.take(fold.validation), arch, run.training)
-        kept = calibration(arch, fitted.weights, fitted.scaler, mine.integers)
+        fitted = fit(mine, windows.take(fold.validation), arch, run.training, lambda at, of, row: report((at, of)))
+        origin = {
+            "dataset": dataset.head.name,
+            "dataset_hash": dataset.hash,
+            "simulated": dataset.head.simulated,
+            "subjects": sorted({str(s) for s in mine.subject}),
+            "validation_subjects": sorted({str(s) for s in windows.subject[fold.validation]}),
+        }
         bundle = Bundle(
             arch,
             fitted.weights,
             dataset.layout,
             fitted.scaler,
-            gestures,
+            run.gestures,
             asdict(run.windows),
             run.live.to_dict(),
-            {
-                "dataset": dataset.head.name,
-                "dataset_hash": dataset.hash,
-                "simulated": dataset.head.simulated,
-                "subjects": sorted({str(s) for s in mine.subject}),
-                "validation_subjects": sorted({str(s) for s in windows.subject[fold.validation]}),
-            },
-            kept,
+            origin,
+            calibration(arch, fitted.weights, fitted.scaler, mine.integers),
         )
         keep_bundle(bundle, path, dataset)
-        tell(f"trained for {fold.name}, {fitted.seconds:.0f} s")
         return bundle
-
-    def people() -> Iterator[HeldOutPerson]:
-        for fold in folds:
-            bundle = bundle_of(fold)
-            before = _predictors(bundle, int8)
-            for person in fold.subjects:
-                yield HeldOutPerson(person, before, partial(_adapt_to, bundle, person, spec, int8))
-
-    result = score_adaptation(
-        windows,
-        people(),
-        {r.id: r.epoch_ms for r in dataset.recordings},
-        use=use,
-        random=random,
-        seed=run.evaluation.seed,
-        progress=lambda person: tell(f"adapted to {person}"),
-    )
-    return {"split": division.text, "simulated": dataset.head.simulated, "spec": asdict(spec), **result}
 
 
 def _adapt_to(bundle: Bundle, person: str, spec: PersonalSpec, int8: bool, own: WindowSet) -> Predictors | None:

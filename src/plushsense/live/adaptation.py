@@ -17,6 +17,7 @@ bundle is adapted only if more of them are predicted correctly, their log loss c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -145,21 +146,7 @@ def personalise(
     used_examples = examples.take(np.isin(y, recorded))
     labels = original.gestures.labels
     used = tuple(labels[k] for k in np.unique(used_examples.y))
-    # Fewer gestures make the others worse: on makeability, up to 5 of 10 cost nobody more than one recording.
-    needed = max(2, -(-len(labels) // 2))
-    if len(used) < needed:
-        missing = ", ".join(label for label in labels if label not in used)
-        raise BadInput(
-            f"The recordings of {subject} are too few to adapt to: {needed} of the bundle's {len(labels)} gestures "
-            f"with {spec.least} recordings each are needed, better all; there are {len(used)}. Record more of: "
-            f"{missing}.",
-            reason="too_few_recordings",
-            subject=subject,
-            needed=needed,
-            gestures=len(labels),
-            least=spec.least,
-            used=len(used),
-        )
+    _require_gestures(used, labels, subject, spec)
     own = judge(softmax(used_examples.features @ weight.T + bias), used_examples.y, used_examples.recording)
     tried = [(s, _cross_validate(weight, bias, used_examples, s)) for s in spec.strengths]
     strength, adapted_scores = min(tried, key=lambda each: float(each[1].losses.mean()))
@@ -190,6 +177,25 @@ def personalise(
     weights = {**original.weights, **{name: part.astype(np.float32) for name, part in dense.items()}}
     adapted = replace(original, weights=weights, personal=table)
     return Personal(adapted, True, figures, strength, before, after, used, without)
+
+
+def _require_gestures(used: Sequence[str], labels: Sequence[str], subject: str, spec: PersonalSpec) -> None:
+    """Raise `BadInput` if fewer than two gestures, or than half of the ``labels``, are ``used``."""
+    # Fewer gestures make the others worse: on makeability, up to 5 of 10 cost nobody more than one recording.
+    needed = max(2, -(-len(labels) // 2))
+    if len(used) < needed:
+        missing = ", ".join(label for label in labels if label not in used)
+        raise BadInput(
+            f"The recordings of {subject} are too few to adapt to: {needed} of the bundle's {len(labels)} gestures "
+            f"with {spec.least} recordings each are needed, better all; there are {len(used)}. Record more of: "
+            f"{missing}.",
+            reason="too_few_recordings",
+            subject=subject,
+            needed=needed,
+            gestures=len(labels),
+            least=spec.least,
+            used=len(used),
+        )
 
 
 @dataclass(frozen=True, eq=False)

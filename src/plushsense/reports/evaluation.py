@@ -54,7 +54,7 @@ def render(
     Args:
         title: heading of the page.
         dataset: name, subjects, recordings, gestures, streams, layout, licence, hash, warnings (numbers or lists).
-        evaluations: ``Evaluation.to_dict()`` of each, optionally with ``title`` and ``model`` as its name, and
+        evaluations: ``EvaluationResult.to_json()`` of each, optionally with ``title`` and ``model`` as its name, and
             ``simulated`` and ``dataset`` (name, hash) for its data.
         models: a model card of each (symbol, filters, …, provenance, optional ``title``).
         recordings: pictures of the recordings, from `plushsense.reports.quality.describe_recordings`.

@@ -27,7 +27,7 @@ of everything after the head. The following sections come in this order:
   u8 baseline, u8 noise, u32 floor; for each rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; then for each
   of its terms: u8 signal, i8 sign, u8 times, u8 0, u32 threshold
 
-Images with a self-calibration (`plushsense.windows.calibration`) have a version of their own, because its code is
+Images with a self-calibration (`plushsense.windows.self_calibration`) have a version of their own, because its code is
 compiled for such models only. Networks that compute a window again at every step (padding ``mirror``) have no image.
 
 A patch replaces the dense layer of one image. Its head is that of an image with ``PLPT`` for ``PLSH``; then come the
@@ -165,10 +165,15 @@ class IntegerModel:
         Raises:
             ArchError: for a network that has no C (`refuse_image`).
         """
-        arch, layout = self.network.arch, self.layout
-        refuse_image(arch)
-        units_per_ms = self._units_per_ms
-        sections = [
+        refuse_image(self.network.arch)
+        sections = [*self._sizes(), *self._inputs(), *_vectors(self.network.vectors)]
+        sections.append(("filling up to a multiple of 4 bytes", bytes(-sum(len(piece) for _, piece in sections) % 4)))
+        return [*sections, *self._layers(), *self._classes(), *_rules(self.rules)]
+
+    def _sizes(self) -> list[tuple[str, bytes]]:
+        """Return the section of sizes and times."""
+        arch, layout, units_per_ms = self.network.arch, self.layout, self._units_per_ms
+        return [
             (
                 "layers, channels, inputs, classes; step, blocks; span; period, gap, units a ms; smoothing, layout",
                 struct.pack(
@@ -188,6 +193,10 @@ class IntegerModel:
                 ),
             )
         ]
+
+    def _inputs(self) -> list[tuple[str, bytes]]:
+        """Return the sections of measured channels and inputs, and of the self-calibration."""
+        layout, sections = self.layout, list[tuple[str, bytes]]()
         edges = zip(layout.names, layout.valid_min_int, layout.valid_max_int, layout.zero_int, strict=True)
         for name, low, high, zero in edges:
             title = f"channel '{name}': valid from {low} to {high}, zero at {zero}"
@@ -206,8 +215,11 @@ class IntegerModel:
                 plan.append(bytes([*(axes if len(axes) > 1 else 3 * axes), layout.calibration_shift + other]))
             title = "self-calibration: sensors; measured channels, shift of a block and kind of each"
             sections.append((title, b"".join(plan)))
-        sections += _vectors(self.network.vectors)
-        sections.append(("filling up to a multiple of 4 bytes", bytes(-sum(len(piece) for _, piece in sections) % 4)))
+        return sections
+
+    def _layers(self) -> list[tuple[str, bytes]]:
+        """Return the sections of scaling, layers and dense layer."""
+        arch, sections = self.network.arch, list[tuple[str, bytes]]()
         scale = self.network.inputs
         for i in range(len(scale)):
             row = (int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
@@ -227,13 +239,18 @@ class IntegerModel:
         sections.append(
             (f"{_DENSE}: weights of each class", (dense.weights.astype(np.int16) + 128).astype(np.uint8).tobytes())
         )
+        return sections
+
+    def _classes(self) -> list[tuple[str, bytes]]:
+        """Return the sections of affects, labels and title."""
+        arch, sections = self.network.arch, list[tuple[str, bytes]]()
         affects = bytes(AFFECT_CODES[g.affect] + (IDLE_BIT if g.idle else 0) for g in self.gestures.gestures)
         sections.append(("affect of each class, 4 more when it is idle", affects))
         for gesture in self.gestures.gestures:
             idle = ", idle" if gesture.idle else ""
             sections.append((f"class '{gesture.label}', {gesture.affect}{idle}", gesture.label.encode() + b"\0"))
         sections.append((f"title '{arch.title}'", arch.title.encode() + b"\0"))
-        return sections + _rules(self.rules)
+        return sections
 
     def to_bytes(self) -> bytes:
         """Return the bytes of the image."""

@@ -31,9 +31,9 @@ from plushsense.runtime.events import Answer, EventMachine, Update
 from plushsense.runtime.fixed import Ints, integer_logits
 from plushsense.runtime.gate import Gate, Rule
 from plushsense.runtime.health import Health, HealthSettings
-from plushsense.windows.calibration import SelfCalibration
 from plushsense.windows.clock import SampleClock
 from plushsense.windows.features import SampleInputs
+from plushsense.windows.self_calibration import SelfCalibration
 
 InputRows = Sequence[Sequence[int]] | NDArray[np.int64]
 """Raw integer inputs (n, I) of a network."""

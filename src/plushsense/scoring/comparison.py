@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput
-from plushsense.scoring.metrics import summary
+from plushsense.scoring.metrics import Summary, summary
 
 # Up to this number of pairs, all assignments of signs are counted; above it, this many are drawn.
 EXACT_PAIRS = 16
@@ -74,23 +74,24 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class PairResult:
-    """Two models compared on the same people; differences are first minus second.
+    """The comparison of two models on the same people.
 
-    Attributes:
-        difference: the summary {mean, sd, ci95} over people.
-        better, worse: the numbers of people for whom the first is better, or worse.
-        p, p_holm: of the paired permutation test, and corrected for all pairs.
-        effect: the rank-biserial correlation; None without a difference.
+    ``difference`` is first minus second; ``better`` and ``worse`` count people; ``p_holm`` is ``p`` corrected for all
+    pairs; ``effect`` is the rank-biserial correlation.
     """
 
     first: str
     second: str
-    difference: dict[str, Any]
+    difference: Summary
     better: int
     worse: int
     p: float
-    p_holm: float
     effect: float | None
+    p_holm: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {**vars(self), "difference": self.difference.to_json()}
 
 
 def compare_pairs(names: Sequence[str], scores: ArrayLike) -> list[PairResult]:
@@ -102,21 +103,11 @@ def compare_pairs(names: Sequence[str], scores: ArrayLike) -> list[PairResult]:
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 2 or min(table.shape) < 2 or table.shape[1] != len(names):
         raise BadInput(f"A comparison needs the scores of at least 2 models on 2 people; got {table.shape}.")
-    pairs = list(combinations(range(len(names)), 2))
-    differences = [table[:, i] - table[:, j] for i, j in pairs]
-    p_values = [paired_permutation_test(d) for d in differences]
+    pairs = [(names[i], names[j], table[:, i] - table[:, j]) for i, j in combinations(range(len(names)), 2)]
+    p_values = [paired_permutation_test(d) for _, _, d in pairs]
     return [
-        PairResult(
-            first=names[i],
-            second=names[j],
-            difference=summary(d),
-            better=int((d > 0).sum()),
-            worse=int((d < 0).sum()),
-            p=p,
-            p_holm=p_holm,
-            effect=rank_biserial(d),
-        )
-        for (i, j), d, p, p_holm in zip(pairs, differences, p_values, holm(p_values), strict=True)
+        PairResult(first, second, summary(d), int((d > 0).sum()), int((d < 0).sum()), p, rank_biserial(d), corrected)
+        for (first, second, d), p, corrected in zip(pairs, p_values, holm(p_values), strict=True)
     ]
 
 

@@ -75,19 +75,21 @@ def class_scores(counts: Counts) -> ClassScores:
     )
 
 
-def class_rows(counts: Counts, labels: Sequence[str]) -> list[dict[str, Any]]:
-    """Return label and scores of each class as plain values, ready for JSON."""
+class ClassResult(NamedTuple):
+    """The scores of one class, and its number of items."""
+
+    label: str
+    precision: float
+    recall: float
+    f1: float
+    support: int
+
+
+def class_results(counts: Counts, labels: Sequence[str]) -> list[ClassResult]:
+    """Return label and scores of each class of a confusion matrix."""
     scores = class_scores(counts)
-    return [
-        {
-            "label": label,
-            "precision": float(scores.precision[k]),
-            "recall": float(scores.recall[k]),
-            "f1": float(scores.f1[k]),
-            "support": int(scores.support[k]),
-        }
-        for k, label in enumerate(labels)
-    ]
+    columns = (scores.precision.tolist(), scores.recall.tolist(), scores.f1.tolist(), scores.support.tolist())
+    return [ClassResult(*row) for row in zip(labels, *columns, strict=True)]
 
 
 def macro_recall(counts: Counts, all_classes: bool = False) -> float:
@@ -197,22 +199,33 @@ def calibration_error(probabilities: NDArray[np.floating[Any]], truth: NDArray[n
     return float(gaps.sum() / len(truth)) if len(truth) else float("nan")
 
 
-def summary(values: Sequence[float] | NDArray[np.float64]) -> dict[str, Any]:
-    """Return ``{mean, sd, ci95}`` of values, one for each person (or fold).
+class Summary(NamedTuple):
+    """Mean, standard deviation (n − 1) and 95 % interval of the mean of some values; None if not computable."""
 
-    ``sd`` divides by n − 1. ``ci95`` is a percentile bootstrap of the mean with 10 000 resamples and a fixed seed.
-    Values that are not finite are left out; figures that cannot be computed are None.
+    mean: float | None
+    sd: float | None
+    ci95: tuple[float, float] | None
+
+    def to_json(self) -> dict[str, float | list[float] | None]:
+        """Return plain values, ready for JSON."""
+        return {"mean": self.mean, "sd": self.sd, "ci95": None if self.ci95 is None else list(self.ci95)}
+
+
+def summary(values: Sequence[float] | NDArray[np.float64]) -> Summary:
+    """Return the summary of values, one for each person (or fold); those that are not finite are left out.
+
+    The interval is a percentile bootstrap of the mean with 10 000 resamples and a fixed seed.
     """
     table = np.asarray(values, dtype=np.float64)
     table = table[np.isfinite(table)]
     if not len(table):
-        return {"mean": None, "sd": None, "ci95": None}
+        return Summary(None, None, None)
     if len(table) == 1:
-        return {"mean": float(table[0]), "sd": None, "ci95": None}
+        return Summary(float(table[0]), None, None)
     rng = np.random.default_rng(BOOTSTRAP_SEED)
     means = table[rng.integers(0, len(table), size=(RESAMPLES, len(table)))].mean(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
-    return {"mean": float(table.mean()), "sd": float(table.std(ddof=1)), "ci95": [float(low), float(high)]}
+    return Summary(float(table.mean()), float(table.std(ddof=1)), (float(low), float(high)))
 
 
 def _ratio(part: NDArray[np.float64], whole: Counts) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from plushsense.core.errors import ArrayError, BadInput, ConfigError, nearest
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import parse_name
-from plushsense.dataset.importing.saved_windows import SETS, sets_of_session
+from plushsense.dataset.store import SAVED_SETS, sets_of_session
 
 Index = NDArray[np.int64]
 
@@ -83,7 +83,6 @@ class Split:
 
 
 SAVED = "saved"
-SAVED_SETS = tuple(name for name, *_ in SETS)
 _FILES, _RANDOM = "files", "random"
 _HOLDOUTS = {
     "recordings:holdout": Split("recordings", order=_FILES),

@@ -19,7 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings, propose
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import forget
-from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.publishing.checking import validate_package
 from plushsense.dataset.store import HEAD
 from plushsense.deploy.profile import profile
@@ -41,10 +40,11 @@ from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.pages.export.exports import folder_digest
+from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings
-from plushsense.workflow.datasets import check_dataset, publish_dataset
+from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
 from plushsense.workflow.export import export
 from plushsense.workflow.networks import FIRST_NETWORK, REFIT
 from plushsense.workflow.preparation import count_people, refits
@@ -143,12 +143,12 @@ def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         "dataset": str(spec["dest"]),
         "recordings": done.recordings,
         "subjects": done.subjects,
-        "added": done.added,
+        "added": done.to_json()["added"],
         "already_there": done.already_there,
-        "warnings": done.notes,
+        "warnings": list(done.notes),
         "flagged": len(done.warnings),
-        "left_out": done.left_out,
-        "rejected": done.rejected,
+        "left_out": [entry.to_json() for entry in done.left_out],
+        "rejected": [entry.to_json() for entry in done.rejected],
         "seconds": round(done.seconds, 2),
     }
 
@@ -211,14 +211,12 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             rejected.append({"file": source.name, "reason": Sentence.of(refusal)})
             continue
         notes += done.notes
-        rejected += done.rejected
+        rejected += [entry.to_json() for entry in done.rejected]
         flagged += len(done.warnings)
     if not dest.exists():
         raise refusals[0]
     if len(sources) > 1:
-        before = len(done.notes)
-        propose(done, adopting=True)
-        notes += done.notes[before:]
+        notes += propose(done, adopting=True).notes[len(done.notes) :]
     dataset = open_dataset(dest)
     return {
         "name": dataset.head.name if restored else "",
@@ -251,29 +249,9 @@ def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
     return {"dataset": str(spec["dest"]), "recordings": done["recordings"], "people": done["people"]}
 
 
-def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Write a pseudonymised copy of ``dataset`` to ``place``; the other keys are arguments of `pseudonymise`.
-
-    Raises:
-        ConfigError: if ``words`` is missing, as in a job resumed after a restart, because words are never stored.
-    """
-    if "words" not in spec:
-        message = "The words to remove are not stored: enter them again on the publish page."
-        raise ConfigError(message, reason="words_not_stored")
-    done = pseudonymise(
-        spec["dataset"],
-        spec["place"],
-        key=spec["key"],
-        words=spec["words"],
-        drop_notes=spec.get("drop_notes", False),
-        progress=partial(reporter.stage, "rewriting"),
-    )
-    return done.to_dict()
-
-
 def run_backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Write the data set ``dataset`` into the new backup ``place``."""
-    return {**backup(spec["dataset"], spec["place"], progress=reporter.count).to_dict(), "dataset": spec["dataset"]}
+    return {**asdict(backup(spec["dataset"], spec["place"], progress=reporter.count)), "dataset": spec["dataset"]}
 
 
 def run_restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -302,7 +280,7 @@ def run_forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Publish ``dataset`` as the package ``place``; the other keys are arguments of `publish_dataset`."""
+    """Publish ``dataset`` as the package ``place``; the other keys are those of `PublishSpec`."""
     key = spec.get("key") or None
     if key is not None:
         try:
@@ -313,7 +291,7 @@ def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             raise DatasetError(message, reason="key_not_written", file=file, why=why) from None
     options = {name: value for name, value in spec.items() if name not in ("dataset", "place")}
     options |= {"columns": tuple(spec.get("columns", ())), "key": key}
-    return publish_dataset(spec["dataset"], spec["place"], **options, progress=reporter.stage).to_dict()
+    return publish_dataset(spec["dataset"], spec["place"], PublishSpec(**options), reporter.stage).to_dict()
 
 
 def run_validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -325,9 +303,9 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("dry"):
-        from plushsense.trials.estimate import preview_training
+        from plushsense.workflow.estimate import preview_training
 
-        return preview_training(spec["dataset"], config, warn=reporter.warn)
+        return preview_training(spec["dataset"], config, warn=reporter.warn).to_json()
     out = Path(spec["out"])
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
@@ -335,7 +313,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     first = epochs if config.windows.context == ANYWHERE and config.anywhere.hard_share > 0 else 0
     each, again = first + epochs + tuning, refits(config, count_people(open_dataset(spec["dataset"])))
 
-    def epoch(at: int, of: int, row: dict[str, Any]) -> None:
+    def epoch(at: int, of: int, row: EpochRow) -> None:
         what = str(row.get("what", ""))
         second, part = what.startswith(REFIT), what.removeprefix(REFIT).lstrip(", ")
         past = {"": first, FIRST_NETWORK: 0}.get(part, first + epochs)
@@ -358,7 +336,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     bundle = done.save(free_path(out, done.bundle.to_bytes()))
     return {
         "bundle": str(bundle),
-        "scores": done.scores,
+        "scores": done.scores.to_json(),
         "seconds": round(done.seconds, 1),
         "parameters": done.bundle.arch.parameters,
         "title": done.bundle.arch.title,
@@ -372,7 +350,7 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     out = Path(spec["out"])
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.trials.budget import BudgetProgress, make_network
+    from plushsense.workflow.budget import BudgetProgress, make_network
     from plushsense.workflow.reporting import load_evaluation
 
     clock = Clock()
@@ -392,7 +370,7 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         progress=report,
         warn=reporter.warn,
     )
-    return {**_evaluation(load_evaluation(done["evaluation"])), **done, "out": done["evaluation"]}
+    return {**_evaluation(load_evaluation(done.evaluation)), **done.to_json(), "out": str(done.evaluation)}
 
 
 def _evaluation(table: dict[str, Any]) -> dict[str, Any]:
@@ -414,9 +392,9 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
     if spec.get("split"):
         config = config.for_split(spec["split"])
     if spec.get("dry"):
-        from plushsense.trials.estimate import preview_evaluation
+        from plushsense.workflow.estimate import preview_evaluation
 
-        return preview_evaluation(spec["dataset"], config, warn=reporter.warn)
+        return preview_evaluation(spec["dataset"], config, warn=reporter.warn).to_json()
     reporter.progress(stage="reading", share=0.0)
 
     from plushsense.workflow.api import evaluate_run
@@ -440,51 +418,32 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 
 def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Run a sweep; return the folder ``out`` and main values of the summary, or the preview for a dry run."""
-    from plushsense.experiments.sweep.run import preview, sweep
+    """Run a sweep; return the folder ``out`` and main values of the result, or the preview for a dry run."""
+    from plushsense.experiments.sweep.run import SweepProgress, preview, sweep
 
     changes = dict(spec.get("changes", {}))
     if spec.get("dry"):
-        return preview(spec["dataset"], spec["grid"], measure=True, warn=reporter.warn, **changes)
+        return preview(spec["dataset"], spec["grid"], measure=True, warn=reporter.warn, **changes).to_json()
     reporter.progress(stage="reading", share=0.0)
     clock = Clock()
 
-    def training(at: JobProgress) -> None:
+    def training(at: SweepProgress) -> None:
         row = at.best and at.best.row
         best = row and {key: row[key] for key in ("arch", "filters", "accuracy", "macro_f1")}
-        counts = {"done": at.done, "trainings": at.total, "resumed": at.resumed, "what": at.name}
-        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(at.share))
-
-    done = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
-    s = done.summary
-    for lost in s["failed"]:
-        network = f"{lost['arch']} {lost['filters']}"
-        reporter.warn(Sentence(f"{network} was given up: {lost['why']}", "network_lost", network=network))
-    keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
-    return {"out": str(done.out), **{key: s[key] for key in keys}}
-
-
-def run_search(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Run a search; return the folder ``out`` and main values of the summary, or the preview for a dry run."""
-    from plushsense.experiments.search.run import preview_search, search
-
-    changes = {**spec.get("asked", {}), **spec.get("changes", {})}
-    if spec.get("dry"):
-        return preview_search(spec["dataset"], spec["grid"], measure=True, warn=reporter.warn, **changes)
-    reporter.progress(stage="reading", share=0.0)
-    clock = Clock()
-
-    def training(at: Any) -> None:
-        best = at.best and {"title": at.best.name, "macro_f1": at.best.score}
-        counts = {"rung": at.rung, "rungs": at.rungs, "networks": at.networks, "what": at.name}
-        counts |= {"done": at.done, "trainings": at.total, "resumed": at.resumed}
+        counts: dict[str, Any] = {"done": at.done, "trainings": at.total, "resumed": at.resumed, "what": at.name}
+        if at.rung:
+            counts |= {"rung": at.rung, "rungs": at.rungs, "networks": at.networks}
         share = min(1.0, at.share)
         reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(share))
 
-    done = search(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
-    s = done.summary
-    keys = ("name", "split", "leaky", "context", "simulated", "candidates", "winner", "smallest_equal", "seconds")
-    return {"out": str(done.out), **{key: s[key] for key in keys}, "command": s["command"]}
+    done = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
+    for lost in done.failed:
+        network = f"{lost.arch} {lost.filters}"
+        reporter.warn(Sentence(f"{network} was given up: {lost.why}", "network_lost", network=network))
+    keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
+    stored = done.to_json()
+    halving = {key: stored["halving"][key] for key in ("winner", "smallest_equal")} if done.halving else {}
+    return {"out": str(done.out), **{key: stored[key] for key in keys}, **halving}
 
 
 def run_profile(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -547,7 +506,7 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "make": run_make,
     "train": run_train,
     "sweep": run_sweep,
-    "search": run_search,
+    "search": run_sweep,
     "evaluate": run_evaluate,
     "import": run_import,
     "inspect": run_inspect,
@@ -557,7 +516,6 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "simulate": run_simulate,
     "profile": run_profile,
     "validate": run_validate,
-    "pseudonymise": run_pseudonymise,
     "backup": run_backup,
     "restore": run_restore,
     "forget": run_forget,

@@ -22,7 +22,7 @@ from plushsense.models.net import Net
 from plushsense.training.augment import Transform
 from plushsense.training.fast.net import FastNet, can_train
 from plushsense.training.fast.plan import plan_net
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochRow, TrainSpec
 
 import torch  # isort: skip - after models.net, which says how to install it
 from torch import Tensor
@@ -46,7 +46,7 @@ class FitState:
     means: Sequence[NDArray[np.float32]]
     squares: Sequence[NDArray[np.float32]]
     random: NDArray[np.uint8]
-    history: list[dict[str, Any]]
+    history: list[EpochRow]
     kept: dict[int, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
     best: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from plushsense.core.errors import DivergedError, TrainingError
 from plushsense.models.arch import Arch
 from plushsense.models.net import Net
 from plushsense.scoring.metrics import accuracy_over_people
-from plushsense.training.augment import Channels, Transform, augmentations
+from plushsense.training.augment import Channels, augmentations
 from plushsense.training.engine import (
     Adam,
     Engine,
@@ -27,7 +26,7 @@ from plushsense.training.engine import (
     slices,
     torch_threads,
 )
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
 
@@ -35,8 +34,7 @@ import torch  # isort: skip - after models.net, which says how to install it
 from torch import Tensor
 from torch.nn import functional as F
 
-# Called with (epoch, maximum epochs, row of the history).
-Progress = Callable[[int, int, dict[str, Any]], None]
+Weights = dict[str, NDArray[np.float32]]
 
 # Probability of a gesture from which an idle window is hard.
 _HARD = 0.3
@@ -58,7 +56,7 @@ class FittedNetwork:
 
     weights: dict[str, NDArray[np.float32]]
     scaler: Scaler
-    history: list[dict[str, Any]]
+    history: list[EpochRow]
     best_epoch: int
     seconds: float
     kept: dict[int, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
@@ -70,7 +68,7 @@ def fit(
     validation: WindowSet | None,
     arch: Arch,
     spec: TrainSpec | None = None,
-    progress: Progress | None = None,
+    progress: EpochProgress | None = None,
     keep: Collection[int] = (),
     start: FitState | None = None,
     save: Callable[[FitState], None] | None = None,
@@ -85,81 +83,158 @@ def fit(
         keep: epochs after which a copy of the weights is stored. With a constant learning rate, these equal the weights
             of trainings with fewer epochs.
         start: state to continue from, with the same windows and settings but more epochs; the result is bit for bit
-            that of an uninterrupted training.
-        save: called with such a state every ``save_every_s`` seconds, also with early stopping.
+            that of an uninterrupted training. ``save`` is called with one every ``save_every_s`` seconds.
         weights: how often each window of ``train`` counts in an epoch, (N,). Whole numbers give the same network as
             windows that are repeated; of fractions, each epoch draws whether the window counts once more.
 
     Raises:
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
     """
-    began = time.perf_counter()
+    began = saved = time.perf_counter()
     spec = spec or TrainSpec()
+    validation = validation if validation is not None and len(validation) else None
     _check(train, arch, "train on")
-    if validation is not None and len(validation):
-        _check(validation, arch, "validate on")
-    device = _device(spec.device)
-    vectors = train.vectors if arch.vector is not None else ()
-    scaler = (
-        Scaler.none(train.units, vectors)
-        if spec.scaling == "none"
-        else Scaler.fit(train.integers if weights is None else train.integers[repeated(weights)], vectors)
-    )
-    x, y = _tensors(train, scaler, arch, device)
-    val_data = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
-    stops = val_data is not None and spec.patience is not None
-    if start is not None and stops and not start.best:
-        raise TrainingError(
-            "A training with early stopping cannot go on from a state that holds no best weights: leave patience out."
-        )
+    _check(validation, arch, "validate on")
+    device, scaler = _device(spec.device), _scaler(train, arch, spec, weights)
+    data = _tensors(train, scaler, arch, device)
+    val_data = None if validation is None else _tensors(validation, scaler, arch, device)
     # The fast engine starts its own threads, in each of which PyTorch uses one.
     threads = 1 if is_fast(arch, device) else spec.threads
     with torch.random.fork_rng(devices=[]), repeatable(allow_tf32=True), torch_threads(threads):
+        channels = Channels(train.vectors, scaler, device, arch.vector is not None)
+        most = len(train) if weights is None else int(np.ceil(weights.sum()))
+        training = _Training(arch, spec, channels, most, val_data is not None, start)
+        with closing(training.net):
+            for epoch in range(len(training.history) + 1, spec.epochs + 1):
+                rate = spec.learning_rate_at(epoch)
+                loss, accuracy = training.train(rate, *data, weights)
+                row: EpochRow = {"epoch": epoch, "train_loss": loss, "train_accuracy": accuracy}
+                _measure(row, training.net, val_data, validation)
+                row["learning_rate"] = rate
+                _refuse_not_finite(row, spec)
+                training.history.append(row)
+                if epoch in keep:
+                    training.kept[epoch] = training.net.export_weights()
+                if progress is not None:
+                    progress(epoch, spec.epochs, row)
+                if training.is_over(row):
+                    break
+                if save is not None and time.perf_counter() - saved >= save_every_s:
+                    save(training.state())
+                    saved = time.perf_counter()
+            return training.finished(scaler, time.perf_counter() - began)
+
+
+def _scaler(train: WindowSet, arch: Arch, spec: TrainSpec, weights: NDArray[np.float64] | None) -> Scaler:
+    """Return the scaling of the inputs, fitted to the training windows as often as they count."""
+    vectors = train.vectors if arch.vector is not None else ()
+    if spec.scaling == "none":
+        return Scaler.none(train.units, vectors)
+    return Scaler.fit(train.integers if weights is None else train.integers[repeated(weights)], vectors)
+
+
+class _Training:
+    """A training under way: the network, its optimiser, the order of the windows, and what is kept of the epochs.
+
+    Args:
+        most: largest number of windows in an epoch.
+        validated: whether there are windows for early stopping.
+        start: state to continue from.
+    """
+
+    def __init__(
+        self, arch: Arch, spec: TrainSpec, channels: Channels, most: int, validated: bool, start: FitState | None
+    ) -> None:
+        self._spec, self._stops = spec, validated and spec.patience is not None
+        if start is not None and self._stops and not start.best:
+            raise TrainingError(
+                "A training with early stopping cannot go on from a state that holds no best weights: leave patience "
+                "out."
+            )
         torch.manual_seed(spec.seed)
         initial = Net(arch)
         if start is not None:
             initial.import_weights(start.weights)
-        most = len(train) if weights is None else int(np.ceil(weights.sum()))
-        net = engine(arch, initial, device, min(spec.batch, most), spec.threads)
-        order = torch.Generator().manual_seed(spec.seed)
-        augment = augmentations(spec.augment, Channels(train.vectors, scaler, device, arch.vector is not None))
-        adam = Adam(net.parameters, fused=True, weight_decay=spec.weight_decay, decayed=net.decayed)
-        if start is not None:
-            adam.restore(
-                start.steps, *([torch.from_numpy(m.copy()) for m in ms] for ms in (start.means, start.squares))
-            )
-            order.set_state(torch.from_numpy(start.random.copy()))
-        with closing(net):
-            history: list[dict[str, Any]] = [] if start is None else [dict(row) for row in start.history]
-            kept = {} if start is None else {epoch: dict(weights) for epoch, weights in start.kept.items()}
-            saved = time.perf_counter()
-            best_epoch, best_score, best = 0, float("-inf"), net.export_weights()
-            if start is not None and stops:
-                best_epoch, best_score, best = *_best(history, spec), dict(start.best)
-            for epoch in range(len(history) + 1, spec.epochs + 1):
-                row: dict[str, Any] = {"epoch": epoch}
-                rate = spec.learning_rate_at(epoch)
-                row["train_loss"], row["train_accuracy"] = _train(net, adam, rate, x, y, spec, order, augment, weights)
-                row |= _measure(net, val_data, validation)
-                row["learning_rate"] = rate
-                _refuse_not_finite(row, spec)
-                history.append(row)
-                if epoch in keep:
-                    kept[epoch] = net.export_weights()
-                if progress is not None:
-                    progress(epoch, spec.epochs, row)
-                if spec.patience is not None and stops:
-                    if (score := _score(row, spec)) > best_score:
-                        best_epoch, best_score, best = epoch, score, net.export_weights()
-                    elif epoch - best_epoch >= spec.patience:
-                        break
-                if save is not None and time.perf_counter() - saved >= save_every_s:
-                    save(_state(adam, net, order, history, kept, best if best_epoch else None))
-                    saved = time.perf_counter()
-            if best_epoch == 0:
-                best_epoch, best = len(history), net.export_weights()
-            state = None if spec.patience is not None else _state(adam, net, order, history, kept)
-    return FittedNetwork(best, scaler, history, best_epoch, time.perf_counter() - began, kept, state)
+        self.net = engine(arch, initial, channels.device, min(spec.batch, most), spec.threads)
+        self._order = torch.Generator().manual_seed(spec.seed)
+        self._augment = augmentations(spec.augment, channels)
+        self._adam = Adam(self.net.parameters, fused=True, weight_decay=spec.weight_decay, decayed=self.net.decayed)
+        self.history: list[EpochRow] = []
+        self.kept: dict[int, Weights] = {}
+        self._best_epoch, self._best_score, self._best = 0, float("-inf"), self.net.export_weights()
+        if start is None:
+            return
+        self._adam.restore(
+            start.steps, *([torch.from_numpy(m.copy()) for m in ms] for ms in (start.means, start.squares))
+        )
+        self._order.set_state(torch.from_numpy(start.random.copy()))
+        self.history = [row.copy() for row in start.history]
+        self.kept = {epoch: dict(weights) for epoch, weights in start.kept.items()}
+        if self._stops:
+            scores = [self._score(row) for row in self.history]
+            self._best_epoch, self._best_score = int(np.argmax(scores)) + 1, max(scores)
+            self._best = dict(start.best)
+
+    def train(self, rate: float, x: Windows, y: Tensor, weights: NDArray[np.float64] | None) -> tuple[float, float]:
+        """Train one epoch at a learning rate; return mean loss and accuracy over its batches."""
+        # Sum on the device: reading a number from a GPU in every batch would make the CPU wait.
+        sums, n_windows = torch.zeros(2, device=y.device), 0
+        if weights is None:
+            shuffled = torch.randperm(len(x), generator=self._order)
+        else:
+            # Whole numbers draw nothing, so that the order is that of windows that are repeated.
+            offset = 0.5 if (weights == np.rint(weights)).all() else float(torch.rand(1, generator=self._order))
+            counted = torch.from_numpy(repeated(weights, offset))
+            shuffled = counted[torch.randperm(len(counted), generator=self._order)]
+        shuffled = shuffled.to(y.device)
+        for at in slices(len(shuffled), self._spec.batch):
+            batch = shuffled[at]
+            # The batch statistics of a few remaining windows would be noisy; they are used in other epochs.
+            if n_windows and len(batch) < min(8, self._spec.batch):
+                continue
+            truth = y[batch]
+            loss, logits = self.net.step(x, batch, truth, self._augment, self._order)
+            self._adam.step(rate)
+            sums[0] += loss * len(batch)
+            sums[1] += (logits.argmax(dim=1) == truth).sum()
+            n_windows += len(batch)
+        return float(sums[0]) / n_windows, float(sums[1]) / n_windows
+
+    def is_over(self, row: EpochRow) -> bool:
+        """Keep the weights if the epoch is the best so far; return whether early stopping ends the training."""
+        if self._spec.patience is None or not self._stops:
+            return False
+        epoch, score = len(self.history), self._score(row)
+        if score > self._best_score:
+            self._best_epoch, self._best_score, self._best = epoch, score, self.net.export_weights()
+            return False
+        return epoch - self._best_epoch >= self._spec.patience
+
+    def state(self) -> FitState:
+        """Return the state to continue from after the last epoch."""
+        return FitState(
+            epoch=len(self.history),
+            steps=self._adam.steps,
+            weights=self.net.export_weights(),
+            means=[mean.cpu().numpy().copy() for mean in self._adam.means],
+            squares=[square.cpu().numpy().copy() for square in self._adam.squares],
+            random=self._order.get_state().numpy().copy(),
+            history=[row.copy() for row in self.history],
+            kept=dict(self.kept),
+            best=dict(self._best) if self._best_epoch else {},
+        )
+
+    def finished(self, scaler: Scaler, seconds: float) -> FittedNetwork:
+        """Return the network with the best weights, or without early stopping with the last."""
+        if not self._best_epoch:
+            self._best_epoch, self._best = len(self.history), self.net.export_weights()
+        state = None if self._spec.patience is not None else replace(self.state(), best={})
+        return FittedNetwork(self._best, scaler, self.history, self._best_epoch, seconds, self.kept, state)
+
+    def _score(self, row: EpochRow) -> float:
+        """Return the score of an epoch for early stopping; higher is better."""
+        loss, accuracy = row["validation_loss"], row["validation_accuracy"]
+        return float((accuracy or 0.0) if self._spec.stop_on == "accuracy" else -(loss or 0.0))
 
 
 def repeated(weights: NDArray[np.float64], offset: float = 0.5) -> NDArray[np.int64]:
@@ -169,38 +244,6 @@ def repeated(weights: NDArray[np.float64], offset: float = 0.5) -> NDArray[np.in
     """
     counts = np.diff(np.floor(np.cumsum(weights) + offset), prepend=0.0)
     return np.repeat(np.arange(len(weights)), counts.astype(np.int64))
-
-
-def _state(
-    adam: Adam,
-    net: Engine,
-    order: torch.Generator,
-    history: list[dict[str, Any]],
-    kept: Mapping[int, dict[str, NDArray[np.float32]]],
-    best: dict[str, NDArray[np.float32]] | None = None,
-) -> FitState:
-    return FitState(
-        epoch=len(history),
-        steps=adam.steps,
-        weights=net.export_weights(),
-        means=[mean.cpu().numpy().copy() for mean in adam.means],
-        squares=[square.cpu().numpy().copy() for square in adam.squares],
-        random=order.get_state().numpy().copy(),
-        history=[dict(row) for row in history],
-        kept=dict(kept),
-        best=dict(best or {}),
-    )
-
-
-def _score(row: Mapping[str, Any], spec: TrainSpec) -> float:
-    """Return the score of an epoch for early stopping; higher is better."""
-    return float(row["validation_accuracy"] if spec.stop_on == "accuracy" else -row["validation_loss"])
-
-
-def _best(history: list[dict[str, Any]], spec: TrainSpec) -> tuple[int, float]:
-    """Return the first epoch with the best score, and the score."""
-    scores = [_score(row, spec) for row in history]
-    return int(np.argmax(scores)) + 1, max(scores)
 
 
 def predict(
@@ -225,7 +268,7 @@ def with_hard_negatives(
     arch: Arch,
     spec: TrainSpec,
     share: float,
-    progress: Progress | None = None,
+    progress: EpochProgress | None = None,
 ) -> WindowSet:
     """Return the training windows with hard negatives: idle windows that a first network takes for a gesture.
 
@@ -252,54 +295,17 @@ def with_hard_negatives(
     return train.joined(candidates.take(at[hardest[gesture[hardest] >= _HARD]]))
 
 
-def _train(
-    net: Engine,
-    adam: Adam,
-    rate: float,
-    x: Windows,
-    y: Tensor,
-    spec: TrainSpec,
-    order: torch.Generator,
-    augment: Transform | None,
-    weights: NDArray[np.float64] | None,
-) -> tuple[float, float]:
-    """Train one epoch at a learning rate; return mean loss and accuracy over its batches."""
-    # Sum on the device: reading a number from a GPU in every batch would make the CPU wait.
-    sums, n_windows = torch.zeros(2, device=y.device), 0
-    if weights is None:
-        shuffled = torch.randperm(len(x), generator=order)
-    else:
-        # Whole numbers draw nothing, so that the order is that of windows that are repeated.
-        offset = 0.5 if (weights == np.rint(weights)).all() else float(torch.rand(1, generator=order))
-        counted = torch.from_numpy(repeated(weights, offset))
-        shuffled = counted[torch.randperm(len(counted), generator=order)]
-    shuffled = shuffled.to(y.device)
-    for at in slices(len(shuffled), spec.batch):
-        batch = shuffled[at]
-        # The batch statistics of a few remaining windows would be noisy; they are used in other epochs.
-        if n_windows and len(batch) < min(8, spec.batch):
-            continue
-        truth = y[batch]
-        loss, logits = net.step(x, batch, truth, augment, order)
-        adam.step(rate)
-        sums[0] += loss * len(batch)
-        sums[1] += (logits.argmax(dim=1) == truth).sum()
-        n_windows += len(batch)
-    return float(sums[0]) / n_windows, float(sums[1]) / n_windows
-
-
-def _measure(net: Engine, data: tuple[Windows, Tensor] | None, windows: WindowSet | None) -> dict[str, float | None]:
-    """Compute loss and accuracies of validation without training, as a part of a row of the history."""
+def _measure(row: EpochRow, net: Engine, data: tuple[Windows, Tensor] | None, windows: WindowSet | None) -> None:
+    """Compute loss and accuracies of validation without training, and write them into the row."""
+    row["validation_loss"] = row["validation_accuracy"] = row["validation_accuracy_people"] = None
     if data is None or windows is None:
-        return dict.fromkeys(("validation_loss", "validation_accuracy", "validation_accuracy_people"))
+        return
     x, y = data
     logits = net.logits(x)
     predicted = logits.argmax(dim=1)
-    return {
-        "validation_loss": float(F.cross_entropy(logits, y)),
-        "validation_accuracy": float((predicted == y).float().mean()),
-        "validation_accuracy_people": accuracy_over_people(windows.y, predicted.cpu().numpy(), windows.subject),
-    }
+    row["validation_loss"] = float(F.cross_entropy(logits, y))
+    row["validation_accuracy"] = float((predicted == y).float().mean())
+    row["validation_accuracy_people"] = accuracy_over_people(windows.y, predicted.cpu().numpy(), windows.subject)
 
 
 def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.device) -> tuple[Windows, Tensor]:
@@ -308,7 +314,9 @@ def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.devic
     return Windows(x, arch, device), torch.from_numpy(windows.y.astype(np.int64)).to(device)
 
 
-def _check(windows: WindowSet, arch: Arch, purpose: str, some: bool = True) -> None:
+def _check(windows: WindowSet | None, arch: Arch, purpose: str, some: bool = True) -> None:
+    if windows is None:
+        return
     if some and not len(windows):
         raise TrainingError(
             f"There are no windows to {purpose}: check the data set, the gestures and the split.", reason="no_windows"
@@ -326,9 +334,9 @@ def _check(windows: WindowSet, arch: Arch, purpose: str, some: bool = True) -> N
         )
 
 
-def _refuse_not_finite(row: dict[str, Any], spec: TrainSpec) -> None:
-    for name in ("train_loss", "validation_loss"):
-        if row[name] is not None and not np.isfinite(row[name]):
+def _refuse_not_finite(row: EpochRow, spec: TrainSpec) -> None:
+    for name, loss in (("train_loss", row["train_loss"]), ("validation_loss", row["validation_loss"])):
+        if loss is not None and not np.isfinite(loss):
             raise DivergedError(
                 f"The {name.replace('_', ' ')} is no longer a number in epoch {row['epoch']} at the learning rate "
                 f"{row['learning_rate']:g}: try a lower one, such as {spec.learning_rate / 10:g}.",

@@ -9,7 +9,7 @@ network, not the labels, so that a few epochs on the training windows do not ove
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from plushsense.models.arch import NORM_EPSILON, Arch, reflected
 from plushsense.models.net import Net, VectorNet
 from plushsense.runtime.integer import deployable, rounded_weights
 from plushsense.training.engine import Adam, slices, torch_threads
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
 
@@ -42,7 +42,7 @@ class FineTuned:
     """
 
     weights: Weights
-    history: list[dict[str, Any]]
+    history: list[EpochRow]
 
 
 def fine_tune(
@@ -53,7 +53,7 @@ def fine_tune(
     calibration: Mapping[str, Any],
     spec: TrainSpec,
     epochs: int,
-    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+    progress: EpochProgress | None = None,
 ) -> FineTuned:
     """Fine-tune trained weights for rounding with the value ranges of ``calibration``, which do not change.
 
@@ -73,7 +73,7 @@ def fine_tune(
         raise TrainingError(f"{epochs} epochs of fine-tuning: accepted are 1 and more.")
     x = torch.from_numpy(scaler.apply(train.integers[:, :, train.integers.shape[2] - arch.span :]))
     highest = spec.learning_rate_at(spec.epochs) / _SLOWER
-    history: list[dict[str, Any]] = []
+    history: list[EpochRow] = []
     with torch.random.fork_rng(devices=[]), torch_threads(spec.threads):
         teacher = Net(arch)
         teacher.import_weights(weights)
@@ -95,7 +95,7 @@ def fine_tune(
                 total += float(loss.detach()) * len(batch)
             history.append({"epoch": epoch, "train_loss": total / len(x), "learning_rate": rate})
             if progress is not None:
-                progress(epoch, epochs, history[-1] | {"what": "fine-tuning for 8 bits", "validation_accuracy": None})
+                progress(epoch, epochs, {**history[-1], "what": "fine-tuning for 8 bits", "validation_accuracy": None})
     return FineTuned(network.export_weights(), history)
 
 

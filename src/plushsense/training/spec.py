@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from typing import Any, Required, TypedDict
 
 from plushsense.core.errors import ConfigError, check_known, check_seed
 from plushsense.training.augment import parse_augmentation
@@ -126,6 +127,29 @@ class TrainSpec:
         reads = {"reads": "units of the layout"} if self.scaling == "none" else {}
         return {"version": TRAINING_VERSION} | self.to_dict() | reads
 
+
+class EpochRow(TypedDict, total=False):
+    """What one epoch of a training gave.
+
+    ``train_loss`` and ``train_accuracy`` are means over the batches, measured while training; in fine-tuning, the loss
+    is the Kullback-Leibler divergence from the float network. Figures of validation are over all its windows, or those
+    of people (see `accuracy_over_people`); None without validation. ``accuracy`` is that of validation as the scores
+    count it; ``what`` names a network other than the one that is scored.
+    """
+
+    epoch: Required[int]
+    train_loss: Required[float]
+    train_accuracy: float
+    validation_loss: float | None
+    validation_accuracy: float | None
+    validation_accuracy_people: float | None
+    learning_rate: float
+    accuracy: float | None
+    what: str
+
+
+EpochProgress = Callable[[int, int, EpochRow], None]
+"""Called with (epoch, maximum of epochs, row of the epoch)."""
 
 # "search": paper, section 3.6.1; "loso": paper, section 4.4; "paper" is the same schedule, with the network and windows
 # of the paper (see PADDING and CONTEXT). "people" is our own: with so few validation people, their loss does not tell

@@ -51,6 +51,14 @@ class HealthFit:
     widened: tuple[str, ...]
     still_ms: int
 
+    def described(self) -> dict[str, Any]:
+        """Return the amount of data and what was found in it, for the report of a bundle."""
+        return {
+            "hours": round(self.seconds / 3600, 3),
+            "end_stops": list(self.widened),
+            "longest_still_ms": self.still_ms,
+        }
+
 
 def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettings | None = None) -> HealthFit:
     """Fit limits with which the sensors of ``subjects`` are never at fault.
@@ -205,9 +213,7 @@ def fit_decisions(
         ConfigError: for a coverage or a share out of range.
         DatasetError: when ``subjects`` is empty.
     """
-    for name, value in (("coverage", coverage), ("known_share", known_share)):
-        if not 0.5 <= value < 1.0:
-            raise ConfigError(f"{name} is {value!r}; accepted are shares from 0.5 to under 1.")
+    aims = _AnswerAims(coverage, known_share)
     spec, people = spec or DecideSpec(), sorted(set(subjects))
     if not people:
         raise DatasetError("Decision settings are fitted on people who were held back, and there are none.")
@@ -215,69 +221,96 @@ def fit_decisions(
     health = fit_health(dataset, everybody, spec.health)
     if "health" not in keep:
         spec = replace(spec, health=health.settings)
-    gate: dict[str, Any] | None = None
+    gate: dict[str, Any] = {}
     if "gate" not in keep:
         fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
-        spec, gate = replace(spec, gate=fitted.settings), fitted.report
+        spec, gate = replace(spec, gate=fitted.settings), {"gate": fitted.report}
     streams = marked_streams(bundle, dataset, people, spec)
-    idle = [k for k, gesture in enumerate(bundle.gestures.gestures) if gesture.idle]
-    report: dict[str, Any] = {
-        "people": len(people),
-        "streams": len(streams),
-        "hours": round(sum(h.trace.seconds for h in streams) / 3600, 3),
-        "gestures": sum(t.gesture not in (OTHER, *idle) for h in streams for t in h.truths),
-        "simulated": dataset.head.simulated,
-    }
+    report = {"people": len(people), **_described(streams, bundle.gestures), "simulated": dataset.head.simulated}
     if streams:
-        if "known_margin" not in keep:
-            labelled = labelled_steps(bundle, streams, spec)
-            spec = replace(spec, known_margin=known_threshold(labelled, bundle.gestures, known_share))
-        costs = ErrorCosts()
-        if dataset.head.simulated or dataset.layout.is_labelled:
-            # Nobody practises there between the marked gestures, so every event outside of them is false.
-            costs = replace(costs, unmarked=costs.outside)
-        tuned = tune(streams, spec, bundle.gestures, costs, keep)
-        spec = tuned.spec
+        spec, report["events"] = _fit_events(bundle, dataset, streams, spec, aims, keep)
         labelled = labelled_steps(bundle, streams, spec)
-        report["events"] = {
-            "on": "streams",
-            "cost": _round(tuned.cost),
-            "cost_before": _round(tuned.cost_before),
-            "tried": tuned.tried,
-            "moved": {name: list(values) for name, values in tuned.moved.items()},
-        }
     else:
         labelled = labelled_windows(bundle, dataset, people)
         report["events"] = {"on": "nothing: nobody who was held back has a stream", "moved": {}}
     if len(labelled.truth):
-        if "known_margin" not in keep:
-            spec = replace(spec, known_margin=known_threshold(labelled, bundle.gestures, known_share))
-        if "sure" not in keep:
-            spec = replace(spec, sure=sure_threshold(labelled, coverage))
-        report["answers"] = _answers(labelled, spec, coverage, known_share, bool(streams))
-    report["health"] = {
-        "people": len(everybody),
-        "hours": round(health.seconds / 3600, 3),
-        "end_stops": list(health.widened),
-        "longest_still_ms": health.still_ms,
+        spec = _fit_answers(labelled, spec, bundle.gestures, aims, keep)
+        report["answers"] = _answers(labelled, spec, aims, bool(streams))
+    report["health"] = {"people": len(everybody), **health.described()}
+    return replace(spec, fitted=report | gate)
+
+
+def _described(streams: Sequence[MarkedStream], gestures: GestureSet) -> dict[str, Any]:
+    """Return counts of the streams and of the gestures in them."""
+    idle = [k for k, gesture in enumerate(gestures.gestures) if gesture.idle]
+    return {
+        "streams": len(streams),
+        "hours": round(sum(h.trace.seconds for h in streams) / 3600, 3),
+        "gestures": sum(t.gesture not in (OTHER, *idle) for h in streams for t in h.truths),
     }
-    if gate is not None:
-        report["gate"] = gate
-    return replace(spec, fitted=report)
+
+
+@dataclass(frozen=True)
+class _AnswerAims:
+    """Share of the steps whose set of classes holds the true one, and of those that count as a known gesture."""
+
+    coverage: float
+    known_share: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.5 <= value < 1.0:
+                raise ConfigError(f"{name} is {value!r}; accepted are shares from 0.5 to under 1.")
+
+
+def _fit_events(
+    bundle: Bundle,
+    dataset: Dataset,
+    streams: Sequence[MarkedStream],
+    spec: DecideSpec,
+    aims: _AnswerAims,
+    keep: Collection[str],
+) -> tuple[DecideSpec, dict[str, Any]]:
+    """Return the event settings of least cost, and a report on the search."""
+    if "known_margin" not in keep:
+        labelled = labelled_steps(bundle, streams, spec)
+        spec = replace(spec, known_margin=known_threshold(labelled, bundle.gestures, aims.known_share))
+    costs = ErrorCosts()
+    if dataset.head.simulated or dataset.layout.is_labelled:
+        # Nobody practises there between the marked gestures, so every event outside of them is false.
+        costs = replace(costs, unmarked=costs.outside)
+    tuned = tune(streams, spec, bundle.gestures, costs, keep)
+    report = {
+        "on": "streams",
+        "cost": _round(tuned.cost),
+        "cost_before": _round(tuned.cost_before),
+        "tried": tuned.tried,
+        "moved": {name: list(values) for name, values in tuned.moved.items()},
+    }
+    return tuned.spec, report
+
+
+def _fit_answers(
+    labelled: LabelledSteps, spec: DecideSpec, gestures: GestureSet, aims: _AnswerAims, keep: Collection[str]
+) -> DecideSpec:
+    """Return the settings with the thresholds for known gestures and for the set of classes."""
+    if "known_margin" not in keep:
+        spec = replace(spec, known_margin=known_threshold(labelled, gestures, aims.known_share))
+    if "sure" not in keep:
+        spec = replace(spec, sure=sure_threshold(labelled, aims.coverage))
+    return spec
 
 
 def _round(value: float) -> float | None:
     return round(value, 4) if np.isfinite(value) else None
 
 
-def _answers(
-    labelled: LabelledSteps, spec: DecideSpec, coverage: float, known_share: float, steps: bool
-) -> dict[str, Any]:
-    by_person = left_out_coverage(labelled, coverage)
+def _answers(labelled: LabelledSteps, spec: DecideSpec, aims: _AnswerAims, steps: bool) -> dict[str, Any]:
+    by_person = left_out_coverage(labelled, aims.coverage)
     people = len(set(labelled.person.tolist()))
     return {
         "on": "steps in the second half of a recording" if steps else "windows, not smoothed",
-        "coverage": coverage,
+        "coverage": aims.coverage,
         "recordings": len(np.unique(labelled.recording)),
         # Coverage of each person with the threshold fitted to the others, as for a new person.
         "coverage_left_out": _round(float(np.mean(by_person))) if by_person else None,
@@ -285,7 +318,7 @@ def _answers(
         # Largest share of new people for which n people can give a guarantee: n / (n + 1).
         "people_bound": _round(people / (people + 1)),
         "classes_in_set": _round(float((labelled.shares >= spec.sure * ONE).sum(axis=1).mean())),
-        "known_share": known_share,
+        "known_share": aims.known_share,
     }
 
 

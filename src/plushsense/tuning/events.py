@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from plushsense.core.gestures import GestureSet
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import AFFECT_CODES, BEGUN, ENDED, NAMED, NO_GESTURE, Update
-from plushsense.runtime.trace import Trace, TraceReplayer
+from plushsense.runtime.replay import TraceReplayer
+from plushsense.runtime.trace import Trace
 from plushsense.scoring.events import ErrorCosts
 
 OTHER = -1

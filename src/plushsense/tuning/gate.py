@@ -20,19 +20,8 @@ from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.dataset.store import Dataset
 from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
-from plushsense.runtime.gate import (
-    HELD,
-    JERK,
-    LEVEL,
-    MOST_LAG,
-    GateSettings,
-    Rule,
-    Signal,
-    Term,
-    firings,
-    follow,
-    raw_signals,
-)
+from plushsense.runtime.gate import HELD, JERK, LEVEL, MOST_LAG, GateSettings, Rule, Signal, Term
+from plushsense.runtime.replay import firings, follow, raw_signals
 from plushsense.tuning.gate_rules import BETWEEN, CALM, LEFT_OUT, FoundRule, Heights, Material, best_rule, material_of
 
 LEAD = 1200

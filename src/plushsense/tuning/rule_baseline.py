@@ -16,8 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +59,6 @@ class RuleBaselineSettings:
     window_s: float = 4.0
     negative_s: float = 1.0
     positive_s: float = 1.5
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return asdict(self)
 
 
 class _Swings:
@@ -217,19 +212,12 @@ def rule_baseline_events(frames: Frames, layout: Layout, settings: RuleBaselineS
     return events + reader.silence()
 
 
-def fit_rule_baseline(
-    dataset: Dataset,
-    gestures: GestureSet,
-    subjects: Collection[str],
-) -> tuple[RuleBaselineSettings, dict[str, Any]]:
+def fit_rule_baseline(dataset: Dataset, gestures: GestureSet, subjects: Collection[str]) -> RuleBaselineSettings:
     """Tune the thresholds on the recordings of ``subjects``.
 
     ``shock`` and ``touch_shock`` are the lowest counts at which at most 2 % of the positive and neutral recordings
     would cause a negative event (1 % by each rule). ``swing`` is the lowest of a few values at which at most 2 % of the
     neutral and at most 2 % of the negative recordings would cause a positive event.
-
-    Returns:
-        The settings, and a report on the recordings used and the errors that remain.
 
     Raises:
         ConfigError: for gestures without affects.
@@ -261,25 +249,12 @@ def fit_rule_baseline(
         raise ConfigError("None of these people recorded a gesture that is not negative: include other people.")
     thresholds = np.ceil(np.quantile(np.array(peaks), 1.0 - _MAX_WRONG / 2, axis=0)).astype(int) + 1
     settings = RuleBaselineSettings(int(thresholds[0]) if shock else 0, int(thresholds[1]) if touch else 0)
-    shares: dict[str, float] = {}
     for swing in _SWINGS if touch else ():
         candidate = RuleBaselineSettings(settings.shock, settings.touch_shock, swing)
-        shares = {
-            a: float(np.mean([_is_answered_positive(x, layout, candidate) for x in xs]))
-            for a, xs in unanswered.items()
-            if xs
-        }
-        if max(shares.values(), default=0.0) <= _MAX_WRONG:
-            settings = candidate
-            break
-    report = {
-        "people": len(people),
-        "recordings": len(used),
-        "wrong_allowed": _MAX_WRONG,
-        "answered_as_a_caress": {a: round(s, 4) for a, s in shares.items()},
-        **settings.to_dict(),
-    }
-    return settings, report
+        wrong = (np.mean([_is_answered_positive(x, layout, candidate) for x in xs]) for xs in unanswered.values() if xs)
+        if all(share <= _MAX_WRONG for share in wrong):
+            return candidate
+    return settings
 
 
 _SWINGS = tuple(round(100 * 1.25**n) for n in range(18))

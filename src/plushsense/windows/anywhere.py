@@ -32,20 +32,17 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.core.sentences import plural
 from plushsense.dataset.marks import LabelledStretch
 from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInfo
 from plushsense.windows.clock import Segment
 from plushsense.windows.cut import (
     ANYWHERE,
+    RecordingCutter,
     WindowCut,
     WindowSet,
     WindowSpec,
     assemble,
     drop_long_recordings,
-    from_recording,
-    refuse_still_clocks,
-    without_window,
 )
 from plushsense.windows.features import network_inputs
 from plushsense.windows.sessions import SessionReader
@@ -154,8 +151,8 @@ def cut_anywhere(
         DatasetError: if there is no window.
     """
     anywhere = anywhere or AnywhereSpec()
-    layout = dataset.layout
-    reach = max(layout.samples(spec.window_s), layout.samples(spec.span_s) if spec.span_s else 0)
+    cutter = RecordingCutter(dataset, replace(spec, context=ANYWHERE))
+    reach = cutter.reach
     used, left_out = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
     idle = next((g for g in gestures.gestures if g.idle), None)
     adrift = {(r.subject, r.session) for r in dataset.recordings if r.stream_row < 0}
@@ -174,25 +171,15 @@ def cut_anywhere(
         if progress is not None:
             progress(done + 1, len(dataset.streams))
     reached = {r.id for r, _ in (*moving, *resting)}
-    cuts: list[tuple[RecordingInfo, WindowCut]] = []
-    sessions = SessionReader(dataset)
-    for recording in (r for r in used if r.id not in reached):
-        instead = from_recording(sessions.recording(recording), dataset, reach, layout.samples(spec.step_s))
-        if not instead:
-            left_out.append(without_window(recording, sessions))
-        cuts += [(recording, c) for c in instead]
+    cuts = [(recording, cut) for recording in used if recording.id not in reached for cut in cutter.cut(recording)]
     gesturing = len(moving) + sum(not gestures.get(r.gesture).idle for r, _ in cuts)
     n_idle = round(gesturing * anywhere.idle_share / (1.0 - anywhere.idle_share))
     quiet = _evenly(resting, max(n_idle // 2, n_idle - len(free)))
     quiet += _evenly(free, n_idle - len(quiet))
     cuts += [(recording, place.cut(reach)) for recording, place in (*moving, *quiet)]
     if not cuts:
-        refuse_still_clocks(dataset, sessions)
-        raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: {plural(len(used), 'recording')} of "
-            f"{plural(len(gestures), 'gesture')}."
-        )
-    return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
+        cutter.refuse_none(used, gestures)
+    return replace(assemble(cuts, gestures, dataset), left_out=(*left_out, *cutter.left_out))
 
 
 def _evenly(places: Sequence[tuple[RecordingInfo, _Place]], most: int) -> list[tuple[RecordingInfo, _Place]]:

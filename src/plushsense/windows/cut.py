@@ -208,6 +208,68 @@ def _from_stream(segments: list[_Read], first: int, last: int, window: int, reac
     return cuts
 
 
+class RecordingCutter:
+    """Cuts recordings into windows as a `WindowSpec` says; recordings of one stream should follow each other.
+
+    Attributes:
+        reach: samples of a window with what its network needs before it.
+        left_out: recordings that gave no window, with the reason.
+    """
+
+    def __init__(self, dataset: Dataset, spec: WindowSpec) -> None:
+        layout = dataset.layout
+        self._dataset, self._spec = dataset, spec
+        self._window, self._step = layout.samples(spec.window_s), layout.samples(spec.step_s)
+        self.reach = max(self._window, layout.samples(spec.span_s) if spec.span_s else 0)
+        self.left_out: list[Sentence] = []
+        self._sessions = SessionReader(dataset)
+        self._stream, self._segments = "", list[_Read]()
+
+    def cut(self, recording: RecordingInfo) -> list[WindowCut]:
+        """Return the windows of a recording; if there is none, add it to `left_out`."""
+        cuts: list[WindowCut] = []
+        if self._spec.context == "stream" and recording.stream_row >= 0:
+            cuts = self._from_stream(recording)
+        elif self._spec.context == ROWS:
+            segments = whole_recording(self._dataset.read(recording), self._dataset.layout)
+            cuts = from_recording(segments, self._dataset, self.reach, self._step)
+            cuts = [replace(cut, context=ROWS) for cut in cuts]
+        if not cuts and self._spec.context != ROWS:
+            cuts = from_recording(self._sessions.recording(recording), self._dataset, self.reach, self._step)
+        if not cuts:
+            still = recording.id in self._sessions.standing
+            message = f"{recording.id}: {'its clock stands still' if still else 'no valid sample'}"
+            reason = "clock_of_recording_still" if still else "no_valid_sample"
+            self.left_out.append(Sentence(message, reason, recording=recording.id))
+        return cuts
+
+    def _from_stream(self, recording: RecordingInfo) -> list[WindowCut]:
+        if recording.stream != self._stream:
+            self._stream = recording.stream
+            segments = self._sessions.stream(self._stream)
+            self._segments = [(segment, network_inputs(segment.data, self._dataset.layout)) for segment in segments]
+        first = recording.stream_row + recording.start
+        last = recording.stream_row + recording.stop
+        return _from_stream(self._segments, first, last, self._window, self.reach, self._step)
+
+    def refuse_none(self, recordings: Sequence[RecordingInfo], gestures: GestureSet) -> None:
+        """Raise DatasetError: the data set gives no window, maybe because clocks stand still."""
+        name, standing = self._dataset.head.name, self._sessions.standing
+        if standing:
+            raise DatasetError(
+                f"Data set '{name}' gives no window: the clock stands still in {len(standing)} recordings, for "
+                f"instance in {min(standing)}: import the files again with all digits of their times, or with "
+                "row_rate_hz in a pattern.",
+                reason="no_windows_clocks_still",
+                n=len(standing),
+            )
+        raise DatasetError(
+            f"Data set '{name}' gives no window: {plural(len(recordings), 'recording')} of "
+            f"{plural(len(gestures), 'gesture')} ({', '.join(gestures.labels[:6])}…).",
+            reason="no_windows",
+        )
+
+
 def cut_windows(
     dataset: Dataset,
     spec: WindowSpec | None = None,
@@ -226,58 +288,33 @@ def cut_windows(
         DatasetError: if there is no window.
     """
     spec = spec or WindowSpec()
-    left_out = list[Sentence]()
-    if gestures is None:
-        free = [g.label for g in dataset.gestures.gestures if g.free_choice]
-        gestures = dataset.gestures.subset([label for label in dataset.gestures.labels if label not in free])
-        left_out = [
-            Sentence(f"{label}: free choice, everybody did something else", "gestures_left_out", gestures=[label])
-            for label in free
-        ]
     if spec.context == ANYWHERE:
         raise ConfigError(
             "Windows anywhere in a stream are cut by plushsense.windows.anywhere.cut_anywhere: call that."
         )
-    layout = dataset.layout
-    if spec.context == ROWS and layout.self_calibration:
+    if spec.context == ROWS and dataset.layout.self_calibration:
         raise ConfigError(
-            f"The layout '{layout.name}' calibrates its sensors in the course of a session, which the context '{ROWS}' "
-            "does not know: use the context loop or stream."
+            f"The layout '{dataset.layout.name}' calibrates its sensors in the course of a session, which the context "
+            f"'{ROWS}' does not know: use the context loop or stream."
         )
-    window, step = layout.samples(spec.window_s), layout.samples(spec.step_s)
-    reach = max(window, layout.samples(spec.span_s) if spec.span_s else 0)
+    of_choice = [] if gestures is not None else [g.label for g in dataset.gestures.gestures if g.free_choice]
+    if gestures is None:
+        gestures = dataset.gestures.subset([label for label in dataset.gestures.labels if label not in of_choice])
+    left_out = [
+        Sentence(f"{label}: free choice, everybody did something else", "gestures_left_out", gestures=[label])
+        for label in of_choice
+    ]
     recordings, too_long = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
-    left_out += too_long
     recordings.sort(key=lambda r: (r.stream, r.id))
+    cutter = RecordingCutter(dataset, spec)
     cuts: list[tuple[RecordingInfo, WindowCut]] = []
-    sessions, stream_id, segments = SessionReader(dataset), "", list[_Read]()
-    for done, recording in enumerate(recordings):
-        own: list[WindowCut] = []
-        if spec.context == "stream" and recording.stream_row >= 0:
-            if recording.stream != stream_id:
-                stream_id = recording.stream
-                segments = [(segment, network_inputs(segment.data, layout)) for segment in sessions.stream(stream_id)]
-            first = recording.stream_row + recording.start
-            last = first + recording.stop - recording.start
-            own = _from_stream(segments, first, last, window, reach, step)
-        if spec.context == ROWS:
-            own = from_recording(whole_recording(dataset.read(recording), layout), dataset, reach, step)
-            own = [replace(cut, context=ROWS) for cut in own]
-        elif not own:
-            own = from_recording(sessions.recording(recording), dataset, reach, step)
-        if not own:
-            left_out.append(without_window(recording, sessions))
-        cuts += [(recording, c) for c in own]
+    for done, recording in enumerate(recordings, 1):
+        cuts += [(recording, cut) for cut in cutter.cut(recording)]
         if progress is not None:
-            progress(done + 1, len(recordings))
+            progress(done, len(recordings))
     if not cuts:
-        refuse_still_clocks(dataset, sessions)
-        raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: {plural(len(recordings), 'recording')} of "
-            f"{plural(len(gestures), 'gesture')} ({', '.join(gestures.labels[:6])}…).",
-            reason="no_windows",
-        )
-    return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
+        cutter.refuse_none(recordings, gestures)
+    return replace(assemble(cuts, gestures, dataset), left_out=(*left_out, *too_long, *cutter.left_out))
 
 
 def constant_windows(windows: WindowSet) -> Sentence | None:
@@ -294,25 +331,6 @@ def constant_windows(windows: WindowSet) -> Sentence | None:
         of=len(windows),
         recording=first,
     )
-
-
-def without_window(recording: RecordingInfo, sessions: SessionReader) -> Sentence:
-    """Return the reason why a recording gives no window."""
-    if recording.id in sessions.standing:
-        return Sentence(f"{recording.id}: its clock stands still", "clock_of_recording_still", recording=recording.id)
-    return Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id)
-
-
-def refuse_still_clocks(dataset: Dataset, sessions: SessionReader) -> None:
-    """Raise DatasetError if clocks that stand still are why a data set gives no window."""
-    if sessions.standing:
-        raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: the clock stands still in {len(sessions.standing)} "
-            f"recordings, for instance in {min(sessions.standing)}: import the files again with all digits of their "
-            "times, or with row_rate_hz in a pattern.",
-            reason="no_windows_clocks_still",
-            n=len(sessions.standing),
-        )
 
 
 def drop_long_recordings(

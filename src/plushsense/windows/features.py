@@ -22,7 +22,7 @@ from plushsense.core.layouts import (
     Layout,
     magnitude_limit,
 )
-from plushsense.windows.calibration import UNIT
+from plushsense.windows.self_calibration import UNIT
 
 
 def magnitude(parts: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,6 +1,6 @@
 """Read streams and recordings as even samples, with what the session gave before them.
 
-Without a self-calibration in the layout (`plushsense.windows.calibration`), these are the samples of
+Without a self-calibration in the layout (`plushsense.windows.self_calibration`), these are the samples of
 `plushsense.windows.clock.resample`. With one, its state at the beginning of a recording is what all earlier frames of
 the person's session gave: those of the stream that contains it, or else the earlier recordings of the session, by time,
 without excluded ones. A recording with nothing before it, or of nobody, uses only itself. So every score is causal.
@@ -16,8 +16,8 @@ import numpy as np
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.quality.measurements import rows_at_one_time
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
-from plushsense.windows.calibration import SelfCalibration
 from plushsense.windows.clock import Segment, resample
+from plushsense.windows.self_calibration import SelfCalibration
 
 
 class SessionReader:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -32,10 +33,10 @@ from plushsense.deploy.quantize import (
     quantize,
     refuse_undeployable,
 )
-from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput
+from plushsense.evaluation.crossval import EvaluationResult, FoldOutput
 from plushsense.evaluation.crossval import evaluate as crossvalidate
-from plushsense.evaluation.leakage import LeakageResult, warn_of_copies
-from plushsense.evaluation.scores import FoldRecord, Predictions, gather_predictions, with_accuracy
+from plushsense.evaluation.leakage import warn_of_copies
+from plushsense.evaluation.scores import FoldRecord, PartResult, Predictions, Scores, gather_predictions, with_accuracy
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
 from plushsense.jobs.progress import JobProgress
@@ -43,7 +44,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle, is_training_content, known_people
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
 from plushsense.windows.cut import ANYWHERE, WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
@@ -115,6 +116,53 @@ class TrainAndPredict:
         return FoldOutput(probabilities, fitted.history, fitted.seconds, fitted.best_epoch, deployed)
 
 
+class DeployedScores(NamedTuple):
+    """Scores of a network in 8 bits; ``agreement`` is the share of the windows with the answer of the float network."""
+
+    accuracy: float | None
+    macro_f1: float | None
+    agreement: float
+
+
+@dataclass(frozen=True)
+class TrainingScores:
+    """The scores of a training on what was held back.
+
+    Attributes:
+        split: how it was divided; description: what was held back, as a sentence.
+        windows: number of scored windows.
+        nobody: the accuracy on recordings of nobody, which do not count otherwise; None without them.
+        simulated: whether the data are those of a virtual toy.
+        int8: the scores in 8 bits; None where the network cannot be deployed.
+    """
+
+    split: str
+    leaky: bool
+    description: str
+    windows: int
+    accuracy: float | None
+    macro_f1: float | None
+    nobody: PartResult | None
+    best_epoch: int
+    simulated: bool
+    int8: DeployedScores | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON, as bundles store them; the description has the key ``said``."""
+        return {
+            "split": self.split,
+            "leaky": self.leaky,
+            "said": self.description,
+            "windows": self.windows,
+            "accuracy": self.accuracy,
+            "macro_f1": self.macro_f1,
+            "nobody": None if self.nobody is None else self.nobody._asdict(),
+            "best_epoch": self.best_epoch,
+            "simulated": self.simulated,
+            "int8": None if self.int8 is None else self.int8._asdict(),
+        }
+
+
 @dataclass(frozen=True)
 class Trained:
     """A trained network: its ``bundle``, the ``history`` of its epochs, and its validation ``scores``.
@@ -124,8 +172,8 @@ class Trained:
     """
 
     bundle: Bundle
-    history: list[dict[str, Any]]
-    scores: dict[str, Any]
+    history: list[EpochRow]
+    scores: TrainingScores
     seconds: float = 0.0
     generation: Generation | None = None
 
@@ -141,15 +189,13 @@ class Trained:
         return training_curves([self.history], title=self.bundle.arch.symbol)
 
     def __repr__(self) -> str:
-        return f"Trained({self.bundle!r}; {self.scores['said']})"
+        return f"Trained({self.bundle!r}; {self.scores.description})"
 
 
 def train(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
     *,
-    arch: str | None = None,
-    filters: Sequence[int] | str | None = None,
     quantize_aware: int = 0,
     fit_decisions: bool = True,
     journal: Journal | None = None,
@@ -168,8 +214,8 @@ def train(
     those of whole gestures with the real signal before them.
 
     Args:
-        config: resolved settings; alternatively give ``arch``, ``filters`` and settings such as ``preset="loso"``,
-            ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
+        config: settings; alternatively give them by name (see `from_settings`): ``arch``, ``filters``,
+            ``preset="loso"``, ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
         quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`).
         fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`). Settings in
             ``config.live`` that differ from the defaults are kept.
@@ -182,61 +228,64 @@ def train(
         warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions;
             by default, they are Python warnings (`PlushSenseWarning`).
     """
-    given = config or from_settings(arch=arch, filters=filters, **settings)
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
-    made = prepare_training(dataset, given, warn, deployable=quantize_aware > 0)
-    run, scored, division = made.run, made.scored, made.division
-    dataset = run.dataset
+    made = prepare_training(dataset, config or from_settings(**settings), warn, deployable=quantize_aware > 0)
+    run, scored, division, dataset = made.run, made.scored, made.division, made.run.dataset
     trainer = NetworkTrainer(
         run, made.windows, division.kind == WHOLE_PEOPLE, quantize_aware, journal,
         _reporting(progress, division.split.separates_people),
     )  # fmt: skip
     checked = trainer.train(division.train, scored.take(division.validation), division.fold.subjects)
-    final = checked
-    if division.refit:
-        final = trainer.train(np.arange(len(made.windows)), scored.take(division.validation[:0]), what=REFIT)
-    fitted = checked.fitted
+    nothing, everything = scored.take(division.validation[:0]), np.arange(len(made.windows))
+    final = trainer.train(everything, nothing, what=REFIT) if division.refit else checked
     predictions, scores = _validated(made, checked, warn)
-    bundle = Bundle(
-        arch=run.network,
-        weights=final.weights,
-        layout=dataset.layout,
-        scaler=final.fitted.scaler,
-        gestures=run.gestures,
-        windowing=_windowing(run),
-        decision=run.live.to_dict(),
-        provenance={
-            "dataset": dataset.head.name,
-            "dataset_hash": dataset.hash,
-            "simulated": dataset.head.simulated,
-            "subjects": sorted({str(s) for s in made.windows.subject[final.at]}),
-            "validation_subjects": sorted({str(s) for s in scored.subject[division.validation]}),
-            "split": division.kind,
-            "refit": division.refit,
-            "context": dict(sorted(Counter(made.windows.context.tolist()).items())),
-            "preset": run.preset,
-            "training": run.training.to_dict(),
-            "quantize_aware": quantize_aware,
-            "scores": scores,
-            "code_version": __version__,
-        },
-        calibration=final.ranges,
-    )
+    bundle = _bundle(made, final, scores, quantize_aware)
     if fit_decisions:
-        reader = replace(bundle, weights=checked.weights, scaler=fitted.scaler)
+        reader = replace(bundle, weights=checked.weights, scaler=checked.fitted.scaler)
         bundle = replace(bundle, decision=_decisions(reader, dataset, run.live, warn))
     if division.refit:
         _keep_predictions(bundle, dataset, predictions)
     trainer.discard()
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
-    history = with_accuracy(fitted.history, division.split.separates_people)
+    history = with_accuracy(checked.fitted.history, division.split.separates_people)
     seconds = checked.seconds + (final.seconds if division.refit else 0.0)
     return Trained(bundle, history, scores, seconds, dataset.generation)
 
 
-def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> tuple[Predictions, dict[str, Any]]:
+def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScores, quantize_aware: int) -> Bundle:
+    """Return the bundle of a trained network, with the decision settings that were given."""
+    run, division = made.run, made.division
+    anywhere = {"anywhere": asdict(run.anywhere)} if run.windows.context == ANYWHERE else {}
+    return Bundle(
+        arch=run.network,
+        weights=final.weights,
+        layout=run.dataset.layout,
+        scaler=final.fitted.scaler,
+        gestures=run.gestures,
+        windowing={**asdict(run.windows), **anywhere},
+        decision=run.live.to_dict(),
+        provenance={
+            "dataset": run.dataset.head.name,
+            "dataset_hash": run.dataset.hash,
+            "simulated": run.dataset.head.simulated,
+            "subjects": sorted({str(s) for s in made.windows.subject[final.at]}),
+            "validation_subjects": sorted({str(s) for s in made.scored.subject[division.validation]}),
+            "split": division.kind,
+            "refit": division.refit,
+            "context": dict(sorted(Counter(made.windows.context.tolist()).items())),
+            "preset": run.preset,
+            "training": run.training.to_dict(),
+            "quantize_aware": quantize_aware,
+            "scores": scores.to_json(),
+            "code_version": __version__,
+        },
+        calibration=final.ranges,
+    )
+
+
+def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> tuple[Predictions, TrainingScores]:
     """Return the predictions for the validation windows, and their scores; also those in 8 bits if there are ranges.
 
     ``warn`` gets a sentence if 8-bit arithmetic changes many predictions.
@@ -248,41 +297,41 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
     sizes = (len(trained.at), len(division.validation), len(test))
     record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
 
-    def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, dict[str, Any], dict[str, Any]]:
+    def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, Scores]:
         predictions = gather_predictions(made.scored, [(division.fold.name, division.fold.test)], [probabilities])
-        found = score_predictions(predictions, [record], made.scored.affects, division.split.separates_people)
-        return predictions, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
+        apart = division.split.separates_people
+        return predictions, score_predictions(predictions, [record], made.scored.affects, apart)
 
-    answers = predict(run.network, trained.weights, fitted.scaler, test, run.training.device)
-    predictions, means, nobody = score(answers)
-    scores: dict[str, Any] = {
-        "split": division.kind,
-        "leaky": division.split.leaky,
-        "said": division.description,
-        "windows": len(test),
-        **means,
-        "nobody": nobody,
-        "best_epoch": fitted.best_epoch,
-        "simulated": run.dataset.head.simulated,
-        "int8": None,
-    }
+    predictions, found = score(predict(run.network, trained.weights, fitted.scaler, test, run.training.device))
+    int8 = None
     if trained.ranges:
         integer = quantize(run.network, trained.weights, fitted.scaler, Ranges.from_dict(trained.ranges))
-        deployed, means, _ = score(integer_probabilities(integer, test.integers))
+        deployed, after = score(integer_probabilities(integer, test.integers))
         agreement = float((deployed.predicted == predictions.predicted).mean())
-        scores["int8"] = {**means, "agreement": agreement}
+        int8 = DeployedScores(after.mean("accuracy"), after.mean("macro_f1"), agreement)
         if agreement < _AGREEMENT:
             advice = "more epochs of --quantize-aware" if trained.tuned else "--quantize-aware 10"
             changed = 100 * (1 - agreement)
             sentence = f"8 bits change {changed:.1f} % of the answers on the validation windows: try {advice}"
             warn(Sentence(sentence, "bits_change", percent=changed))
-    return predictions, scores
+    return predictions, TrainingScores(
+        split=division.kind,
+        leaky=division.split.leaky,
+        description=division.description,
+        windows=len(test),
+        accuracy=found.mean("accuracy"),
+        macro_f1=found.mean("macro_f1"),
+        nobody=found.nobody,
+        best_epoch=fitted.best_epoch,
+        simulated=run.dataset.head.simulated,
+        int8=int8,
+    )
 
 
 def _reporting(progress: EpochProgress | None, apart: bool) -> EpochProgress:
     """Return a callback for the epochs of a training, which adds ``accuracy`` to their rows."""
 
-    def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+    def report(epoch: int, epochs: int, row: EpochRow) -> None:
         if progress is not None:
             progress(epoch, epochs, with_accuracy([row], apart)[0])
 
@@ -318,19 +367,11 @@ def _keep_predictions(bundle: Bundle, dataset: Dataset, predictions: Predictions
     keep_if_possible(journal, _predictions_id(bundle), {**vars(predictions)})
 
 
-def _windowing(run: Run) -> dict[str, Any]:
-    """Return the window settings as a bundle stores them."""
-    anywhere = {"anywhere": asdict(run.anywhere)} if run.windows.context == ANYWHERE else {}
-    return {**asdict(run.windows), **anywhere}
-
-
 def evaluate(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
     *,
     split: str | None = None,
-    arch: str | None = None,
-    filters: Sequence[int] | str | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     cluster: str | None = None,
@@ -339,13 +380,13 @@ def evaluate(
     progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = python_warning,
     **settings: Any,
-) -> Evaluation:
+) -> EvaluationResult:
     """Train and score one network for each fold of ``split``.
 
     Finished folds are stored in the data set's ``cache`` folder, so that an interrupted evaluation can be resumed.
 
     Args:
-        config, arch, filters, settings, warn: as for `train`; also ``train_context`` and ``workers``.
+        config, settings, warn: as for `train`; also ``train_context`` and ``workers``.
         split: "leave-one-subject-out" (default), "by-subject:5", "by-recording:5", "windows:5" (leaky).
         out: a folder for ``evaluation.json`` and ``predictions.parquet``. A folder with an evaluation of other settings
             or data is refused unless ``overwrite``.
@@ -354,7 +395,7 @@ def evaluate(
             stored without it are trained again.
         training_people: train each fold on so many of its people only, for a learning curve; not with ``out``.
     """
-    given = config or from_settings(arch=arch, filters=filters, **settings)
+    given = config or from_settings(**settings)
     run = prepare(dataset, given if split is None else given.for_split(split), warn)
     return evaluate_run(
         run,
@@ -378,7 +419,7 @@ def evaluate_run(
     training_people: int | None = None,
     progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = python_warning,
-) -> Evaluation:
+) -> EvaluationResult:
     """Train and score one network for each fold of a prepared run; the arguments are those of `evaluate`."""
     refuse_hard_negatives(run)
     if out is not None:
@@ -410,10 +451,10 @@ def evaluate_run(
         cluster=cluster,
         seed=run.evaluation.seed,
         validation=run.holds_back,
-        shared_rows=copied_recordings(run.dataset, score.recording_ids),
+        shared_rows=partial(copied_recordings, run.dataset, score.recording_ids),
         progress=progress,
     )
-    warn_of_copies(LeakageResult.from_json(result.table["leakage"]), warn)
+    warn_of_copies(result.leakage, warn)
     if out is not None:
         with run.dataset.generation.writing():
             save_evaluation(result, run, Path(out))

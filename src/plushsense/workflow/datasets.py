@@ -5,25 +5,30 @@ from __future__ import annotations
 import glob
 import html
 import os
-import secrets
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from filelock import FileLock
+
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
-from plushsense.core.files import write_file
 from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.index import as_dataset, change_head, open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
 from plushsense.dataset.publishing.checking import StageProgress
-from plushsense.dataset.publishing.contents import PublishOptions, public_codes, public_labels
+from plushsense.dataset.publishing.contents import ContentsSpec, person_codes, public_codes, public_labels
+from plushsense.dataset.publishing.keys import open_key
 from plushsense.dataset.publishing.package import (
+    CopyResult,
+    PackageSpec,
     PublishResult,
     Reidentification,
     check_output_folder,
     complete_head,
+    copy_dataset,
     publish,
     require_validators,
 )
@@ -39,7 +44,6 @@ if TYPE_CHECKING:
 
 # Largest number of findings that a notebook displays.
 _MOST_FINDINGS = 50
-_KEY_BYTES = 32
 SUFFIX = ".plush"
 
 
@@ -144,28 +148,11 @@ def decide(
     return check_dataset(dataset, only=only, limits=limits, progress=progress), len(marks)
 
 
-def publish_dataset(
-    dataset: Dataset | str | os.PathLike[str],
-    out: str | os.PathLike[str],
-    *,
-    licence: str = "",
-    contact: str = "",
-    consent: str = "",
-    save: bool = False,
-    streams: bool = True,
-    excluded: bool = False,
-    columns: tuple[str, ...] = (),
-    key: str | os.PathLike[str] | None = None,
-    reidentification: bool = True,
-    seed: int = 1,
-    published: str | None = None,
-    thorough: bool = False,
-    progress: StageProgress | None = None,
-) -> PublishResult:
-    """Write a data set as a package with standard metadata, validate it, and compress it to ``out.zip``.
+@dataclass(frozen=True)
+class PublishSpec:
+    """Settings of `publish_dataset`.
 
-    Args:
-        out: a new or empty folder.
+    Attributes:
         licence, contact, consent: an SPDX name, "Name <mail>", a statement; required if ``dataset.toml`` lacks them.
         save: also write these into the data set's ``dataset.toml``.
         streams: also publish the streams of whole sessions, with everything between the gestures.
@@ -173,39 +160,62 @@ def publish_dataset(
         columns: columns of ``subjects.csv`` to publish besides age group and gender.
         key: a file outside the data set, created if absent. Packages made with the same key have the same time shifts;
             without a key they are random.
+        pseudonyms: give people new random codes, which are stored in the key.
         reidentification: test whether people can be recognised, and report it in the package.
+        seed: seed of that test.
         published: ISO date of the publication (default: today).
         thorough: let the slow validators read every row of the streams.
+    """
+
+    licence: str = ""
+    contact: str = ""
+    consent: str = ""
+    save: bool = False
+    streams: bool = True
+    excluded: bool = False
+    columns: tuple[str, ...] = ()
+    key: str | os.PathLike[str] | None = None
+    pseudonyms: bool = False
+    reidentification: bool = True
+    seed: int = 1
+    published: str = ""
+    thorough: bool = False
+
+
+def publish_dataset(
+    dataset: Dataset | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    spec: PublishSpec | None = None,
+    progress: StageProgress | None = None,
+) -> PublishResult:
+    """Write a data set as a package with standard metadata, validate it, and compress it to ``out.zip``.
+
+    Args:
+        out: a new or empty folder.
         progress: called with (name of the stage, done, total).
 
     Raises:
+        ConfigError: for pseudonyms without a key.
         DatasetError: without licence, contact or consent statement, or when ``out`` is not empty or its zip exists.
         MissingExtraError: without the validators, or (for the re-identification) scikit-learn.
     """
+    spec = spec or PublishSpec()
     dataset = as_dataset(dataset)
     folder = Path(out)
     require_validators()
-    head = complete_head(dataset.head, dataset.path, licence, contact, consent)
-    check_output_folder(dataset, folder, repeatable=key is not None)
-    secret = secrets.token_bytes(_KEY_BYTES) if key is None else _read_key(Path(key), dataset.path, folder)
-    options = PublishOptions(streams, excluded, columns, secret)
-    tested = None
-    if reidentification:
-        steps = (lambda done, total: progress("recognising people", done, total)) if progress else None
-        result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset), public_labels(dataset))
-        command = f"plushsense publish DATASET OUT --seed {seed}"
-        tested = Reidentification(report(result, command), verdict(result), result.to_dict())
-    done = publish(
-        dataset,
-        folder,
-        head,
-        options=options,
-        reidentification=tested,
-        published=published,
-        thorough=thorough,
-        progress=progress,
-    )
-    if save:
+    head = complete_head(dataset.head, dataset.path, spec.licence, spec.contact, spec.consent)
+    check_output_folder(dataset, folder, repeatable=spec.key is not None)
+    with _contents_of(dataset, folder, spec) as contents:
+        tested = None
+        if spec.reidentification:
+            steps = (lambda done, total: progress("recognising people", done, total)) if progress else None
+            found = reidentify(dataset, seed=spec.seed, progress=steps)
+            found = found.under(public_codes(dataset, contents), public_labels(dataset))
+            command = f"plushsense publish DATASET OUT --seed {spec.seed}"
+            tested = Reidentification(report(found, command), verdict(found), found.to_dict())
+        package = PackageSpec(contents, tested, spec.published, spec.thorough)
+        done = publish(dataset, folder, head, package, progress)
+    if spec.save:
         try:
             change_head(
                 dataset.path, lambda now: replace(now, licence=head.licence, consent=head.consent, about=head.about)
@@ -218,33 +228,48 @@ def publish_dataset(
     return done
 
 
-def _read_key(path: Path, *beside: Path) -> bytes:
-    """Read the secret that seeds the time shifts; if the file does not exist, create it, readable only by its owner."""
-    for folder in beside:
-        if folder.resolve() in path.resolve().parents:
-            raise DatasetError(f"The key '{path}' lies in '{folder}': store it elsewhere.")
-    try:
-        if path.exists():
-            key = bytes.fromhex(path.read_text(encoding="ascii"))
-            if len(key) < _KEY_BYTES // 2:
-                raise ValueError("too short")
-            return key
-        key = secrets.token_bytes(_KEY_BYTES)
-        write_file(path, key.hex() + "\n", private=True)
-        return key
-    except ValueError:
-        raise DatasetError(
-            f"'{path}' is not a key of plushsense publish: give a file that does not exist yet.",
-            reason="no_key_file",
-            file=path.name,
-        ) from None
-    except OSError as cause:
-        raise DatasetError(
-            f"The key '{path}' cannot be used: {cause.strerror or cause}.",
-            reason="key_not_written",
-            file=path.name,
-            why=cause.strerror or str(cause),
-        ) from None
+def share_copy(
+    dataset: Dataset | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    spec: PublishSpec | None = None,
+    progress: StageProgress | None = None,
+) -> CopyResult:
+    """Write only the data set that `publish_dataset` would put into a package, for people who use PlushSense.
+
+    Of ``spec``, what belongs to metadata and validation has no effect: no licence, contact or consent is needed.
+
+    Raises:
+        ConfigError: for pseudonyms without a key.
+        DatasetError: when ``out`` is not empty, or a file cannot be written.
+    """
+    spec = spec or PublishSpec()
+    dataset = as_dataset(dataset)
+    with _contents_of(dataset, Path(out), spec) as contents:
+        return copy_dataset(dataset, Path(out), contents, progress)
+
+
+@contextmanager
+def _contents_of(dataset: Dataset, out: Path, spec: PublishSpec) -> Iterator[ContentsSpec]:
+    """Yield what to publish; with pseudonyms, hold the lock of the key, which has a code for each person then."""
+    contents = ContentsSpec(spec.streams, spec.excluded, spec.columns, pseudonyms=spec.pseudonyms)
+    if spec.key is None:
+        if spec.pseudonyms:
+            raise ConfigError("Pseudonyms need a key, which stores who has which code: give it with --key FILE.")
+        yield contents
+        return
+    path = Path(spec.key)
+    if not spec.pseudonyms:
+        yield replace(contents, key=open_key(path, dataset.path, out))
+        return
+    # Refuse a place in the data set before the lock is made there.
+    open_key(path, dataset.path, out)
+    with FileLock(path.with_name(f"{path.name}.lock")):
+        before = open_key(path, dataset.path, out)
+        key = before.with_people(person_codes(dataset))
+        if key != before:
+            with dataset.generation.writing():
+                key.write(path)
+        yield replace(contents, key=key)
 
 
 @dataclass(frozen=True)
@@ -276,7 +301,7 @@ class Forgotten:
         return {
             "dataset": self.dataset,
             "done": self.done,
-            **self.plan.to_dict(),
+            **asdict(self.plan),
             "bundles": [vars(b) for b in self.bundles],
             "discarded": self.discarded,
             "elsewhere": self.elsewhere,

@@ -78,7 +78,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         overwrite=True,
         progress=lambda at: progress("folds", at.done, at.total),
         warn=silent,
-    ).to_dict()
+    ).to_json()
     stage(f"4/6  live: {size.live_s:.0f} s of a virtual person left out of the training")
     live = _live(bundle, size.live_s)
     stage("5/6  export C for the toy, which gives the same answers")

@@ -24,7 +24,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE
-from plushsense.training.spec import PADDING, preset
+from plushsense.training.spec import PADDING, EpochRow, TrainSpec, preset
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import InputUnits
 
@@ -395,7 +395,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
     classes_: NDArray[Any]
     n_features_in_: int
     bundle_: Bundle
-    history_: list[dict[str, Any]]
+    history_: list[EpochRow]
 
     def __init__(
         self,
@@ -443,23 +443,10 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         times those of ``class_weight``, are scaled so that their mean is from 1 to 10. They have no effect on
         validation.
         """
-        from sklearn.utils.multiclass import check_classification_targets
-        from sklearn.utils.validation import validate_data
-
         from plushsense.training.fit import fit
 
         layout = self._known_layout()
-        rows, shape = rows_of(X)
-        rows, labels = validate_data(self, rows, y, ensure_all_finite=False)
-        given = self.channels
-        if layout is not None:
-            if given not in (None, layout.n_inputs):
-                raise ArrayError(f"channels is {given}, but the layout '{layout.name}' has {layout.n_inputs} inputs.")
-            given = layout.n_inputs
-        channels, samples = shape_of(rows.shape[1], shape, given)
-        x = rows.reshape(len(rows), channels, samples)
-        refuse_holes(x)
-        check_classification_targets(labels)
+        x, labels = self._windows(X, y, layout)
         people, weights = people_of(groups, len(x)), weights_of(sample_weight, len(x))
         some = weights > 0.0
         x, labels, people, weights = x[some], labels[some], people[some], weights[some]
@@ -471,7 +458,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         spec = preset(self.preset, **numbers, seed=_seed(self.random_state))
         layout = layout or anonymous_layout(x)
         gestures = gestures_of(classes)
-        arch = self._network(channels, len(classes), samples, layout.rate_hz)
+        arch = self._network(x.shape[1], len(classes), x.shape[2], layout.rate_hz)
         x = to_integers(x, layout)
         named = groups is not None
         order = in_own_order(x, index, *([people] if named else []))
@@ -488,6 +475,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             spec,
             weights=None if (trained == 1.0).all() else trained * scaling,
         )
+        codes = [sorted(set(people[part].tolist())) if named else [] for part in (~held_back, held_back)]
         self.classes_, self.history_ = classes, fitted.history
         self.bundle_ = Bundle(
             arch=arch,
@@ -495,23 +483,43 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             layout=layout,
             scaler=fitted.scaler,
             gestures=gestures,
-            windowing={"window_s": samples / layout.rate_hz, "context": "unknown"},
+            windowing={"window_s": x.shape[2] / layout.rate_hz, "context": "unknown"},
             decision=DecideSpec().to_dict(),
-            provenance={
-                "dataset": "arrays given to PlushClassifier",
-                "estimator": {"settings": self._settings(), **labels_table(classes)},
-                "windows": len(x),
-                "weighted": bool((trained != 1.0).any()),
-                "subjects": sorted(set(people[~held_back].tolist())) if named else [],
-                "validation_subjects": sorted(set(people[held_back].tolist())) if named else [],
-                "split": "none",
-                "preset": self.preset,
-                "training": spec.to_dict(),
-                "code_version": __version__,
-            },
+            provenance=self._provenance(spec, len(x), bool((trained != 1.0).any()), codes),
             calibration=calibration(arch, fitted.weights, fitted.scaler, windows.integers[~held_back]),
         )
         return self
+
+    def _windows(self, X: ArrayLike, y: ArrayLike, layout: Layout | None) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return windows (N, C, T) and labels (N,) that scikit-learn has checked."""
+        from sklearn.utils.multiclass import check_classification_targets
+        from sklearn.utils.validation import validate_data
+
+        rows, shape = rows_of(X)
+        rows, labels = validate_data(self, rows, y, ensure_all_finite=False)
+        given = self.channels
+        if layout is not None:
+            if given not in (None, layout.n_inputs):
+                raise ArrayError(f"channels is {given}, but the layout '{layout.name}' has {layout.n_inputs} inputs.")
+            given = layout.n_inputs
+        x = rows.reshape(len(rows), *shape_of(rows.shape[1], shape, given))
+        refuse_holes(x)
+        check_classification_targets(labels)
+        return x, labels
+
+    def _provenance(self, spec: TrainSpec, windows: int, weighted: bool, codes: Sequence[list[str]]) -> dict[str, Any]:
+        return {
+            "dataset": "arrays given to PlushClassifier",
+            "estimator": {"settings": self._settings(), **labels_table(self.classes_)},
+            "windows": windows,
+            "weighted": weighted,
+            "subjects": codes[0],
+            "validation_subjects": codes[1],
+            "split": "none",
+            "preset": self.preset,
+            "training": spec.to_dict(),
+            "code_version": __version__,
+        }
 
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
         """Return logits (N, K) in the order of ``classes_``; for two classes the second minus the first, (N,)."""

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.deploy.quantize import calibration
-from plushsense.evaluation.crossval import EpochProgress, windows_fingerprint
+from plushsense.evaluation.crossval import windows_fingerprint
 from plushsense.jobs.journal import Journal, job_id, keep_if_possible
 from plushsense.models.arch import Arch
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.preparation import Run, add_hard_negatives, outside_streams
 
@@ -111,7 +111,7 @@ class NetworkTrainer:
         run, spec, network = self.run, self.run.training, self.run.network
 
         def reporting(*names: str) -> EpochProgress:
-            def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+            def report(epoch: int, epochs: int, row: EpochRow) -> None:
                 whole = ", ".join(name for name in (*names, row.get("what")) if name)
                 self.progress(epoch, epochs, {**row, "what": whole} if whole else row)
 

@@ -33,7 +33,7 @@ from plushsense.models.arch import (
 )
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
-from plushsense.training.spec import PADDING, PRESETS, VECTOR_AUGMENT, TrainSpec
+from plushsense.training.spec import PADDING, PRESETS, VECTOR_AUGMENT, EpochProgress, TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere, idle_candidates
 from plushsense.windows.cut import (
     ANYWHERE,
@@ -329,7 +329,7 @@ def add_hard_negatives(
     gestures: GestureSet,
     training: TrainSpec,
     others: Collection[str],
-    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+    progress: EpochProgress | None = None,
 ) -> WindowSet:
     """Return training windows of the context "anywhere" with hard negatives.
 

@@ -16,7 +16,7 @@ from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.crossval import Evaluation
+from plushsense.evaluation.crossval import EvaluationResult
 from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -124,14 +124,14 @@ def check_place(out: Path, run: Run, *, replace: bool = False) -> None:
     )
 
 
-def save_evaluation(result: Evaluation, run: Run, out: Path) -> Path:
+def save_evaluation(result: EvaluationResult, run: Run, out: Path) -> Path:
     """Write ``predictions.parquet`` and ``evaluation.json`` (scores, data set, network, settings) to a folder."""
     out.mkdir(parents=True, exist_ok=True)
     # `forget` finds the people in the scores, so that new predictions must never lie beside scores of other people.
     (out / SCORES).unlink(missing_ok=True)
     result.write_predictions(out / PREDICTIONS)
     content = {
-        **result.to_dict(),
+        **result.to_json(),
         "predictions": PREDICTIONS,
         "id": run.id,
         "simulated": run.dataset.head.simulated,
@@ -147,7 +147,7 @@ def save_evaluation(result: Evaluation, run: Run, out: Path) -> Path:
     return path
 
 
-def evaluation_title(result: Evaluation, run: Run) -> str:
+def evaluation_title(result: EvaluationResult, run: Run) -> str:
     """Return a title with network, split, contexts, preset, seed, and the settings that differ from the preset's."""
     context = f"{result.context} context"
     if result.train_context != result.context:
@@ -183,7 +183,7 @@ def card(arch: Arch, **more: Any) -> dict[str, Any]:
 def write_report(
     path: str | os.PathLike[str],
     dataset: Dataset | str | os.PathLike[str],
-    evaluations: Sequence[Evaluation | Mapping[str, Any] | str | os.PathLike[str]] = (),
+    evaluations: Sequence[EvaluationResult | Mapping[str, Any] | str | os.PathLike[str]] = (),
     models: Sequence[Bundle | str | os.PathLike[str]] = (),
     title: str | None = None,
     *,
@@ -207,19 +207,31 @@ def write_report(
     dataset = as_dataset(dataset)
     summary = dataset.summary()
     bundles = [b if isinstance(b, Bundle) else Bundle.load(Path(b)) for b in models]
-    cards = [
-        card(
-            b.arch,
-            rate_hz=b.layout.rate_hz,
-            name=str(b.provenance.get("name", f"{b.arch.symbol} trained on {b.provenance.get('dataset', '?')}"))
-            + (f", adapted to {b.adapted_to}" if b.personal else ""),
-            provenance=dict(b.provenance),
+    pictures = describe_recordings(dataset, recording) if recordings else None
+    with dataset.generation.writing():
+        return write_evaluation_report(
+            Path(path),
+            title=title or f"PlushSense: {summary['name']}",
+            dataset=_properties(summary, dataset.layout.title),
+            evaluations=[_evaluation_table(e) for e in evaluations],
+            models=[_bundle_card(b) for b in bundles],
+            simulated=bool(summary["simulated"]),
+            recordings=pictures,
         )
-        for b in bundles
-    ]
-    properties = {
+
+
+def _bundle_card(bundle: Bundle) -> dict[str, Any]:
+    provenance = dict(bundle.provenance)
+    name = str(provenance.get("name", f"{bundle.arch.symbol} trained on {provenance.get('dataset', '?')}"))
+    adapted = f", adapted to {bundle.adapted_to}" if bundle.personal else ""
+    return card(bundle.arch, rate_hz=bundle.layout.rate_hz, name=name + adapted, provenance=provenance)
+
+
+def _properties(summary: Mapping[str, Any], layout: str) -> dict[str, Any]:
+    """Return the facts of a data set that a report lists."""
+    return {
         "name": summary["name"],
-        "layout": dataset.layout.title,
+        "layout": layout,
         "subjects": summary["subjects"],
         "recordings": summary["recordings"],
         "gestures": [f"{g['label']} ({g['recordings']})" for g in summary["gestures"]],
@@ -230,17 +242,6 @@ def write_report(
         "licence": summary["licence"],
         "hash": summary["hash"],
     }
-    pictures = describe_recordings(dataset, recording) if recordings else None
-    with dataset.generation.writing():
-        return write_evaluation_report(
-            Path(path),
-            title=title or f"PlushSense: {summary['name']}",
-            dataset=properties,
-            evaluations=[_evaluation_table(e) for e in evaluations],
-            models=cards,
-            simulated=bool(summary["simulated"]),
-            recordings=pictures,
-        )
 
 
 def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:
@@ -265,7 +266,7 @@ def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _learning(path: Path) -> dict[str, Any] | None:
-    """Read the learning curve beside an evaluation (`plushsense.trials.budget`); None if there is none."""
+    """Read the learning curve beside an evaluation (`plushsense.workflow.budget`); None if there is none."""
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -273,9 +274,9 @@ def _learning(path: Path) -> dict[str, Any] | None:
     return table if isinstance(table, dict) else None
 
 
-def _evaluation_table(source: Evaluation | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
-    if isinstance(source, Evaluation):
-        return source.to_dict()
+def _evaluation_table(source: EvaluationResult | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
+    if isinstance(source, EvaluationResult):
+        return source.to_json()
     table = dict(source) if isinstance(source, Mapping) else load_evaluation(source)
     # The title names the network, and the model card shows its numbers.
     table.pop("model", None)

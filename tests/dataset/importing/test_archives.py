@@ -40,7 +40,7 @@ def test_a_zip_of_sessions_or_of_people_imports_like_its_folder(tmp_path: Path, 
                 archive.write(file, inside + file.relative_to(tmp_path / "out").as_posix())
         done = import_recordings(path, tmp_path / f"DS{len(inside)}")
         assert (done.recordings, done.subjects, done.streams, done.excluded) == (4, 2, 2, 1)
-        assert done.rejected == []
+        assert done.rejected == ()
         assert done.dataset.head.name == path.stem
     assert sorted(p.name for p in tmp_path.iterdir()) == ["DS0", "DS8", "out", "upload0.zip", "upload8.zip"]
 
@@ -82,7 +82,7 @@ def test_a_member_that_must_not_be_written_is_refused(tmp_path: Path, name: str,
     done = import_recordings(tmp_path / "in" / "x.zip", tmp_path / "in" / "DS", layout="accel-3")
     assert done.recordings == 1
     (refused,) = done.rejected
-    assert re.search(said, refused["reason"]), refused
+    assert re.search(said, refused.reason), refused
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
     assert sorted(p.name for p in (tmp_path / "in").iterdir()) == ["DS", "x.zip"]
     assert not Path("/tmp/evil_1_60.csv").exists()
@@ -148,12 +148,12 @@ def test_encrypted_damaged_and_cut_off(tmp_path: Path) -> None:
     data[at + 8] |= 1
     path.write_bytes(data)
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
-    assert "encrypted" in done.rejected[0]["reason"]
+    assert "encrypted" in done.rejected[0].reason
     data = bytearray(whole)
     data[whole.index(b"Processing") + 3] ^= 1
     path.write_bytes(data)
     done = import_recordings(path, tmp_path / "DS2", layout="accel-3")
-    assert "CRC" in done.rejected[0]["reason"]
+    assert "CRC" in done.rejected[0].reason
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DatasetError, match="no zip, or a damaged one"):
         import_recordings(path, tmp_path / "DS3", layout="accel-3")

@@ -53,6 +53,6 @@ def test_a_pattern_by_hand_that_names_a_counter_is_warned_of(tmp_path: Path) -> 
     channels = [{"name": name, "unit": "", "kind": "sensor", "step": 0.01} for name in ("n", "force")]
     pattern = ImportPattern(layout={"rate_hz": 50.0, "channels": channels}, paths=("{subject}_{label}.csv",))
     said = "'n' is a number of the row: a network would read from it when a recording was made"
-    assert said in preview_import(tmp_path / "src", pattern=pattern).warnings[0]
+    assert said in preview_import(tmp_path / "src", pattern=pattern).messages[0]
     (note,) = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=pattern).notes
     assert said in note and note.reason == "channel_counts"

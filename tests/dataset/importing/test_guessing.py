@@ -14,7 +14,7 @@ from plushsense.core.errors import DatasetError
 from plushsense.dataset.importing import guessing
 from plushsense.dataset.importing.guessing import GuessedPattern, guess_pattern
 from plushsense.dataset.importing.importers import preview_import
-from plushsense.dataset.importing.preview import ImportPreview
+from plushsense.dataset.importing.results import ImportPreview
 
 GESTURES = ("hug", "tap")
 
@@ -55,7 +55,7 @@ def test_parts_of_a_data_set_are_neither_labels_nor_people(tmp_path: Path) -> No
     assert "the label is taken from the path: 'hug' of Test/hug/rep0.csv and 'tap' of Test/tap/rep0.csv" in guess.doubts
     assert "the folders Test, Training, val are parts of a data set, neither labels nor people" in guess.doubts
     assert any("--subjects map.csv" in doubt for doubt in guess.doubts)
-    assert any("people are not known" in note for note in seen.warnings)
+    assert any("people are not known" in note for note in seen.messages)
 
 
 def test_a_part_that_differs_in_every_file_is_the_take(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_cells_of_files_with_other_columns_are_not_used(tmp_path: Path) -> None:
     found, guess, seen = guessed(tmp_path / "src")
     assert "missing" not in found
     assert found["exclude"] == [f"{person}/answers.csv" for person in ("P1", "P2", "P3")]
-    assert (seen.gestures, seen.rejected) == ({"hug": 3, "tap": 3}, [])
+    assert (seen.gestures, seen.rejected) == ({"hug": 3, "tap": 3}, ())
     assert any("files without such rows are left out: P1/answers.csv" in doubt for doubt in guess.doubts)
 
 
@@ -205,7 +205,7 @@ def test_actions_of_microbit_createai(tmp_path: Path, key: str, rate_hz: float) 
     assert found["row_rate_hz"] == found["layout"]["rate_hz"] == rate_hz
     assert (seen.recordings, seen.gestures) == (12, {"hug": 6, "tap": 6})
     assert seen.rows[1].time_ms == 1000 / rate_hz
-    assert seen.warnings == []
+    assert seen.messages == ()
     assert any("micro:bit CreateAI" in doubt for doubt in guess.doubts)
     assert "lists within objects are taken for recordings: 12 in 6 objects" in guess.doubts
     assert any("'name' is taken for the label: 'hug', 'tap'" in doubt for doubt in guess.doubts)
@@ -316,7 +316,7 @@ def test_recordings_of_which_one_lacks_a_channel_can_be_guessed_from(tmp_path: P
     (tmp_path / "src" / "P1.jsonl").write_text("\n".join(map(json.dumps, recordings)))
     found, _, seen = guessed(tmp_path / "src")
     assert names(found) == ["left", "right"]
-    assert any("without a number in every column left out" in note for note in seen.warnings)
+    assert any("without a number in every column left out" in note for note in seen.messages)
 
 
 def test_columns_without_a_name_are_channels_by_their_place(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_every_file_is_accounted_for(tmp_path: Path) -> None:
     before = good.read_bytes()
     done = import_recordings(src, tmp_path / "DS", layout="accel-3")
     assert (done.recordings, done.subjects, done.streams) == (2, 2, 0)
-    refused = {r["file"]: r["reason"] for r in done.rejected}
+    refused = {r.file: r.reason for r in done.rejected}
     assert set(refused) == {
         "ben/notes.txt",
         "ben/Wave_1_3.csv",
@@ -131,12 +131,12 @@ def test_by_label_folders_need_a_mapping_and_say_so(tmp_path: Path) -> None:
         put(src / "Tail tap 1", "Tail tap 1", seed, layout=PLUSH)
     done = import_recordings(src, tmp_path / "DS", layout="plush-15")
     assert done.subjects == 0
-    assert any("--subjects map.csv" in w for w in done.to_dict()["warnings"])
+    assert any("--subjects map.csv" in w for w in done.messages)
     mapping = tmp_path / "map.csv"
     mapping.write_text("file,subject\nTail tap 1_1001_60.csv,S01\nTail tap 1/Tail tap 1_1002_60.csv,S02\n")
     done = import_recordings(src, tmp_path / "DS2", layout="plush-15", subjects=mapping)
     assert done.dataset.subjects == ["S01", "S02"]
-    assert done.rejected[0]["reason"].startswith("not named in the mapping file")
+    assert done.rejected[0].reason.startswith("not named in the mapping file")
     mapping.write_text("name;person\n")
     with pytest.raises(DatasetError, match="file,subject"):
         import_recordings(src, tmp_path / "DS3", layout="plush-15", subjects=mapping)
@@ -198,7 +198,7 @@ def test_labelled_rows_become_recordings_of_a_stream(tmp_path: Path) -> None:
 def test_makeability_imports_whole(imported_study: Any) -> None:
     done = imported_study
     assert (done.recordings, done.subjects, done.streams) == (1485, 27, 24)
-    assert [r["file"] for r in done.rejected] == ["LICENSE"]
+    assert [r.file for r in done.rejected] == ["LICENSE"]
     text = "\n".join(done.warnings)
     assert "18907 rows" in text
     in_recordings = [r for r in done.dataset.recordings if r.flags]
@@ -213,7 +213,7 @@ def test_har_phone_imports_whole(real_data: Path, tmp_path: Path) -> None:
     done = import_recordings(real_data / "har-phone", tmp_path / "DS", layout="phone-6")
     assert done.subjects == 23
     assert done.gestures == ["SEATED", "SITTING_DOWN", "STANDING_UP", "TURNING", "WALKING"]
-    assert sorted(r["file"] for r in done.rejected) == ["executions_info.csv", "subjects_info.csv"]
+    assert sorted(r.file for r in done.rejected) == ["executions_info.csv", "subjects_info.csv"]
     assert sum(r.rows for r in done.dataset.recordings) == sum(s.rows for s in done.dataset.streams)
 
 
@@ -223,7 +223,7 @@ def test_a_simulation_stays_marked(tmp_path: Path) -> None:
     simulate(tmp_path / "virtual", people=1, repetitions=1, gestures=["Tail pull"])
     whole = import_recordings(tmp_path / "virtual", tmp_path / "DS", layout="plush-15")
     assert whole.dataset.head.simulated
-    assert whole.rejected == []
-    assert "are a simulation" in whole.to_dict()["warnings"][0]
+    assert whole.rejected == ()
+    assert "are a simulation" in whole.messages[0]
     assert import_recordings(tmp_path / "virtual" / "P01", tmp_path / "DS1", layout="plush-15").dataset.head.simulated
     assert open_dataset(tmp_path / "DS").head.simulated

@@ -13,10 +13,10 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
-from plushsense.dataset.importing import adding
+from plushsense.dataset.importing import build
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.store import PersonInfo, read_people, write_people
 from plushsense.recording.session_files import SessionEvent
 
@@ -54,8 +54,8 @@ def test_what_is_new_is_added_and_the_rest_counted(tmp_path: Path) -> None:
     put(tmp_path / "more" / "ana", "Shake", 9, epoch=1001)
     for source, counts in (("src", (3, 2, 1)), ("src", (3, 0, 3)), ("more", (4, 1, 0))):
         done = import_recordings(tmp_path / source, tmp_path / "DS", add_to=True)
-        assert (done.recordings, done.added["recordings"], done.already_there) == counts
-        assert done.rejected == []
+        assert (done.recordings, done.added_recordings, done.already_there) == counts
+        assert done.rejected == ()
     assert (tmp_path / "DS" / "recordings" / "ana" / "again-2" / first.name).is_file()
     after = raw(tmp_path / "DS")
     assert before.items() <= after.items()
@@ -151,7 +151,7 @@ def test_a_take_made_again_later_is_set_aside_once(tmp_path: Path, session_write
 def test_two_imports_at_once(tmp_path: Path) -> None:
     put(tmp_path / "src" / "ana", "Shake", 1)
     import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
-    with adding._locked_work_folder(tmp_path / "DS"), pytest.raises(DatasetError, match="Another import is adding"):
+    with build._locked_work_folder(tmp_path / "DS"), pytest.raises(DatasetError, match="Another import is adding"):
         import_recordings(tmp_path / "src", tmp_path / "DS", add_to=True)
 
 
@@ -164,8 +164,8 @@ def test_gestures_that_are_new_keep_their_affect(tmp_path: Path, session_writer:
     done = import_recordings(tmp_path / "out", tmp_path / "DS", add_to=True, gestures=own)
     assert done.dataset.gestures.labels[-1] == "Kiss"
     assert done.dataset.gestures.get("Kiss").affect == "positive"
-    assert done.warnings == []
-    assert json.loads(json.dumps(done.to_dict()))["added"] == {"recordings": 1, "streams": 1}
+    assert done.warnings == ()
+    assert json.loads(json.dumps(done.to_json()))["added"] == {"recordings": 1, "streams": 1}
 
 
 def test_what_the_recorder_says_anew_is_marked_anew(tmp_path: Path) -> None:
@@ -177,7 +177,7 @@ def test_what_the_recorder_says_anew_is_marked_anew(tmp_path: Path) -> None:
         ("e", "include", "me"),
     ]
     append_marks(tmp_path, [Mark(*one) for one in decided])
-    said = [(m.recording, m.action, m.who) for m in adding._new_marks(tmp_path, aside)]
+    said = [(m.recording, m.action, m.who) for m in build._new_marks(read_marks(tmp_path), aside)]
     assert said == [("a", "exclude", "recorder"), ("c", "include", "recorder")]
 
 

@@ -67,7 +67,7 @@ class Place:
         assert all(inside / "DS" in p.parents for p in after - before)
         if done is None:
             return False
-        json.dumps(done.to_dict(), ensure_ascii=False, allow_nan=False).encode("utf-8")
+        json.dumps(done.to_json(), ensure_ascii=False, allow_nan=False).encode("utf-8")
         assert not [p for p in (inside / "DS").rglob("*") if p.is_symlink()]
         again = open_dataset(inside / "DS").recordings
         assert [r.to_text() for r in again] == [r.to_text() for r in done.dataset.recordings]

@@ -25,8 +25,8 @@ def test_a_session_comes_in_without_a_warning_or_a_layout(tmp_path: Path, sessio
     session_writer(tmp_path / "out", "P02", "s1", seed=2, age_group="adult", redo=[0])
     done = import_recordings(tmp_path / "out", tmp_path / "DS")
     assert (done.recordings, done.subjects, done.streams) == (6, 2, 3)
-    assert done.to_dict()["warnings"] == []
-    assert done.rejected == done.left_out == []
+    assert done.messages == ()
+    assert done.rejected == done.left_out == ()
     assert done.companions == 3 * 4
     assert {(r.subject, r.session) for r in done.dataset.recordings} == {("P01", "s1"), ("P01", "s2"), ("P02", "s1")}
     assert all(r.stream == f"{r.subject}/{r.session}/fulldatastream" for r in done.dataset.recordings)
@@ -64,15 +64,15 @@ def test_what_a_crash_left_is_named_and_no_fault(tmp_path: Path, session_writer:
     (folder / "Neck scratch 1_5_9.json").write_text("{")
     (folder / "holiday.png").write_bytes(b"x")
     done = import_recordings(tmp_path / "out", tmp_path / "DS")
-    assert {e["file"].rsplit("/", 1)[-1]: e["reason"].split()[0] for e in done.left_out} == {
+    assert {e.file.rsplit("/", 1)[-1]: e.reason.split()[0] for e in done.left_out} == {
         "Tail pull_5_9.csv.part": "not",
         "Tail pull_6_9.csv.new": "not",
         "Tail pull_7_9.csv.torn": "damaged",
         "session.lock": "a",
         "Neck scratch 1_5_9.json": "the",
     }
-    assert [e["file"] for e in done.rejected] == ["P01/s1/holiday.png"]
-    assert done.warnings == []
+    assert [e.file for e in done.rejected] == ["P01/s1/holiday.png"]
+    assert done.warnings == ()
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_a_damaged_head_rejects_its_session_alone(
     done = import_recordings(tmp_path / "out", tmp_path / "DS")
     assert done.dataset.subjects == ["P01"]
     assert len(done.rejected) == 7
-    assert all(said in e["reason"] for e in done.rejected)
+    assert all(said in e.reason for e in done.rejected)
 
 
 def test_a_recording_that_cannot_be_read_takes_its_sidecar_with_it(tmp_path: Path, session_writer: Writer) -> None:
@@ -101,7 +101,7 @@ def test_a_recording_that_cannot_be_read_takes_its_sidecar_with_it(tmp_path: Pat
     bad = next(folder.glob("Hold*.csv"))
     bad.write_text("")
     done = import_recordings(tmp_path / "out", tmp_path / "DS")
-    assert [e["file"] for e in done.rejected] == [
+    assert [e.file for e in done.rejected] == [
         f"P01/s1/{bad.name}",
         f"P01/s1/{bad.with_suffix('.json').name}",
     ]

@@ -9,8 +9,9 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.importing.guessing import guess_pattern
-from plushsense.dataset.importing.importers import ImportSummary, import_recordings, preview_import
+from plushsense.dataset.importing.importers import import_recordings, preview_import
 from plushsense.dataset.importing.pattern import ImportPattern
+from plushsense.dataset.importing.results import ImportResult
 
 LAYOUT = {"rate_hz": 50.0, "channels": [{"name": "left", "unit": "", "kind": "sensor", "step": 0.01}]}
 
@@ -21,7 +22,7 @@ def samples(path: Path, first_ms: int = 0, name: str = "time_ms", unit: float = 
     path.write_text("\n".join(lines) + "\n")
 
 
-def cuts(done: ImportSummary) -> list[tuple[str, int, int]]:
+def cuts(done: ImportResult) -> list[tuple[str, int, int]]:
     return sorted((r.gesture, r.stream_row, r.rows) for r in done.dataset.recordings)
 
 
@@ -49,8 +50,8 @@ def test_intervals_beside_samples_are_found_and_cut_recordings(
     assert any("the labels are the intervals in files such as P1/labels.csv" in doubt for doubt in guess.doubts)
     done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**found))
     assert cuts(done) == sorted([("hug", 50, 100), ("hug", 150, 50), ("tap", 250, 50)] * 2)
-    assert (done.streams, done.rejected) == (2, [])
-    assert [entry["file"] for entry in done.left_out] == ["P1/labels.csv", "P2/labels.csv"]
+    assert (done.streams, done.rejected) == (2, ())
+    assert [entry.file for entry in done.left_out] == ["P1/labels.csv", "P2/labels.csv"]
     of_first_row = any("counted from the first row" in note for note in done.notes)
     assert of_first_row == (first_ms > 0 and not rows[0].startswith("71"))
 

@@ -9,13 +9,12 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.recorder_csv import parse_name
-from plushsense.dataset.importing.build import ImportSummary, group_flags
 from plushsense.dataset.importing.importers import import_recordings, preview_import
+from plushsense.dataset.importing.results import ImportResult, group_flags
 from plushsense.dataset.importing.truncation import CHOICES
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.labelling import relabel
+from plushsense.dataset.labelling import relabel_recordings
 from plushsense.dataset.marks import BY_HAND, read_marks
-from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.quality.checking import check
 from support import paper_scripts as scripts
 from support.real_times import as_if_real
@@ -23,14 +22,14 @@ from support.real_times import as_if_real
 RECORDINGS = 3 * len(scripts.GESTURES) * 2
 
 
-def imported(source: Path, dest: Path, integers: int = 15, **more: object) -> ImportSummary:
+def imported(source: Path, dest: Path, integers: int = 15, **more: object) -> ImportResult:
     return import_recordings(source, dest, layout=f"plush-{integers}", **more)  # type: ignore[arg-type]
 
 
-def kinds(done: ImportSummary) -> list[str]:
+def kinds(done: ImportResult) -> list[str]:
     """Warnings without those that the virtual people and the missing person codes cause."""
     known = ("these recordings are a simulation", "the folders are gestures")
-    return [w for w in done.to_dict()["warnings"] if not w.startswith(known)]
+    return [w for w in done.messages if not w.startswith(known)]
 
 
 @pytest.fixture
@@ -90,9 +89,9 @@ def test_the_uncut_originals_take_the_place_of_the_cut_recordings(labelled: Path
             # What was cut off is known without the file of choices.
             (labelled / CHOICES).unlink()
         done = imported(labelled, tmp_path / f"DS{number}")
-        assert done.recordings == done.trimmed == done.added["recordings"] == RECORDINGS
-        replaced = [e for e in done.left_out if e["file"].startswith(scripts.LABELLED)]
-        assert len(replaced) == RECORDINGS and all(e["reason"].startswith("cut by the trunc") for e in replaced)
+        assert done.recordings == done.trimmed == done.added_recordings == RECORDINGS
+        replaced = [e for e in done.left_out if e.file.startswith(scripts.LABELLED)]
+        assert len(replaced) == RECORDINGS and all(e.reason.startswith("cut by the trunc") for e in replaced)
         # Rows in names are those before the cut; one name is that of another recording.
         assert ["its name states" in w for w in kinds(done)] == [False, True], kinds(done)
         assert kinds(done)[0].endswith(f": {RECORDINGS} trim their recordings by a mark")
@@ -109,7 +108,7 @@ def test_two_truncations_leave_one_original(labelled: Path, tmp_path: Path) -> N
     done = imported(labelled, tmp_path / "DS")
     assert {Path(r.file).name: r.rows for r in done.dataset.recordings} == whole
     assert {r.start for r in done.dataset.recordings} == {0, 50}
-    copies = [e["reason"] for e in done.left_out if e["file"].startswith(later)]
+    copies = [e.reason for e in done.left_out if e.file.startswith(later)]
     assert set(copies) == {f"a copy, in '{later}', of a recording that is imported"} and len(copies) == RECORDINGS
 
 
@@ -142,7 +141,7 @@ def test_a_backup_of_other_rows_is_a_copy(labelled: Path, tmp_path: Path) -> Non
     lines = changed.read_text().splitlines()
     changed.write_text("\n".join(["1" + lines[0], *lines[1:]]) + "\n")
     done = imported(labelled, tmp_path / "DS")
-    assert [e["file"] for e in done.left_out if "a copy, in" in e["reason"]] == [
+    assert [e.file for e in done.left_out if "a copy, in" in e.reason] == [
         f"{scripts.BACKUP}/Tail tap 2/{changed.name}"
     ]
     (found,) = (r for r in done.dataset.recordings if Path(r.file).name == changed.name)
@@ -167,7 +166,7 @@ def test_the_backup_alone_brings_the_whole_recordings_and_the_choices(labelled: 
     shutil.rmtree(labelled / scripts.LABELLED)
     both = imported(labelled, tmp_path / "DS2")
     assert both.recordings == RECORDINGS
-    assert {later.name in e["file"] for e in both.left_out if "a copy" in e["reason"]} == {True}
+    assert {later.name in e.file for e in both.left_out if "a copy" in e.reason} == {True}
 
 
 def test_a_recording_moved_to_another_label_has_the_label_of_its_folder(labelled: Path, tmp_path: Path) -> None:
@@ -199,7 +198,7 @@ def test_a_correction_after_the_import_reaches_the_data_set(labelled: Path, tmp_
     first, other = sorted((folder / "Tail pull").glob("*.csv"))[:2]
     for path in (first, other):
         path.rename(folder / "Tail tap 2" / path.name)
-    relabel(open_dataset(tmp_path / "DS"), [f"unknown/{other.stem}"], "Back stroke 1", "K")
+    relabel_recordings(open_dataset(tmp_path / "DS"), [f"unknown/{other.stem}"], "Back stroke 1", "K")
     done = import_recordings(labelled, tmp_path / "DS", add_to=True)
     labels = {Path(r.file).name: r.gesture for r in done.dataset.recordings}
     assert (labels[first.name], labels[other.name]) == ("Tail tap 2", "Back stroke 1"), "a person's mark stays"
@@ -219,7 +218,7 @@ def test_later_moves_reach_the_data_set_until_a_person_decides(labelled: Path, t
         (folder / before / name).rename(folder / after / name)
         assert label() == after
         before = after
-    relabel(open_dataset(tmp_path / "DS"), [f"unknown/{name.removesuffix('.csv')}"], "", "K")
+    relabel_recordings(open_dataset(tmp_path / "DS"), [f"unknown/{name.removesuffix('.csv')}"], "", "K")
     assert label() == "Tail pull", "a person's undo stays"
 
 
@@ -248,7 +247,7 @@ def test_choices_that_come_later_are_added_but_decide_nothing_twice(labelled: Pa
     assert imported(labelled, tmp_path / "DS").trimmed == 0
     scripts.choose(labelled)
     done = import_recordings(labelled, tmp_path / "DS", add_to=True)
-    assert (done.added["recordings"], done.trimmed) == (0, RECORDINGS - 1)
+    assert (done.added_recordings, done.trimmed) == (0, RECORDINGS - 1)
     assert import_recordings(labelled, tmp_path / "DS", add_to=True).trimmed == 0
 
 
@@ -264,27 +263,15 @@ def test_choices_that_cannot_be_used(labelled: Path, tmp_path: Path) -> None:
     ):
         path.write_text(text)
         done = imported(labelled, tmp_path / f"in{number}")
-        assert [reason in e["reason"] for e in done.rejected if e["file"] == CHOICES] == [True], text
+        assert [reason in e.reason for e in done.rejected if e.file == CHOICES] == [True], text
         done = imported(labelled / scripts.LABELLED, tmp_path / f"beside{number}")
-        assert sum(reason in w for w in done.to_dict()["warnings"]) == 1
+        assert sum(reason in w for w in done.messages) == 1
         assert done.trimmed == 0
     name = next(p.name for p in (labelled / scripts.LABELLED).rglob("*.csv"))
     path.write_text(f'\ufeff"File Name","Full Path",Length,TruncateN\n{name},/x/{name},9999,5\n')
     done = imported(labelled, tmp_path / "other")
     assert done.trimmed == 0
     assert any("1 do not fit" in w for w in kinds(done))
-
-
-def test_pseudonyms_shift_the_time_in_such_a_name_and_keep_its_mark(labelled: Path, tmp_path: Path) -> None:
-    (odd,) = (labelled / scripts.LABELLED).rglob("* (1).csv")
-    scripts.choose(labelled, every=1)
-    imported(labelled, tmp_path / "DS")
-    pseudonymise(tmp_path / "DS", tmp_path / "OUT", key=tmp_path / "key.csv")
-    done = open_dataset(tmp_path / "OUT")
-    (found,) = (r for r in done.recordings if r.id.endswith(" (1)"))
-    assert Path(found.file).name != odd.name
-    assert (found.gesture, found.start) == ("Tail pull", 40)
-    assert "plushsense import" in (tmp_path / "OUT" / "marks.jsonl").read_text()
 
 
 def test_flags_of_one_kind_are_one_warning() -> None:
@@ -312,7 +299,7 @@ def test_zeros_of_the_accelerometer_that_stand_for_low_values_are_found(tmp_path
     assert "never less than -2000" in found.message
     # They are neither faults of the sensor nor a centre of the sphere of gravity.
     assert not [f for f in checked.findings_of("flat", "stuck", "saturated") if set(f.channels) & {10, 11}]
-    assert not [p for p in done.proposals if p["key"] == "offset"]
+    assert not [p for p in done.proposals if p.key == "offset"]
 
 
 def test_recordings_at_rest_that_the_script_leaves_do_not_make_gestures_people(tmp_path: Path) -> None:
@@ -326,7 +313,7 @@ def test_recordings_at_rest_that_the_script_leaves_do_not_make_gestures_people(t
     done = imported(root, tmp_path / "DS")
     assert (done.recordings, done.subjects, done.streams) == (RECORDINGS + 2, 0, 0)
     assert {r.subject for r in done.dataset.recordings} == {"unknown", "none"}
-    assert {e["reason"] for e in done.rejected} == {"a session stream whose person is not known"}
+    assert {e.reason for e in done.rejected} == {"a session stream whose person is not known"}
 
 
 @pytest.mark.parametrize("integers", [15, 14])
@@ -364,4 +351,4 @@ def test_real_recordings_have_no_such_times(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="holds recordings of a real toy, the source those of a virtual one"):
         import_recordings(moved, tmp_path / "REAL", add_to=True)
     assert len(open_dataset(tmp_path / "REAL").recordings) == 5
-    assert import_recordings(moved, tmp_path / "MIXED", add_to=True).added["recordings"] == 0
+    assert import_recordings(moved, tmp_path / "MIXED", add_to=True).added_recordings == 0

@@ -14,7 +14,8 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.importing.proposals import Sensor, find_sensors, readable_layouts
+from plushsense.dataset.importing.proposals import Sensor, find_sensors
+from plushsense.dataset.importing.sources import readable_layouts
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.quality.checking import check
 from plushsense.dataset.quality.outliers import far_inputs, find_failed_readings
@@ -29,25 +30,25 @@ from support.accelerometers import ACCEL, analogue
 def test_the_zero_of_an_analogue_accelerometer_is_found_and_adopted(tmp_path: Path, zero: float, one_g: float) -> None:
     source = analogue(tmp_path / "R", zero, one_g)
     done = import_recordings(source, tmp_path / "DS", layout="accel-3", adopt_proposals=False)
-    offset = next(p for p in done.proposals if p["key"] == "offset")
-    assert all(abs(value - zero) < 0.05 * one_g for value in offset["value"].values())
-    assert "give a layout with offset" in offset["advice"] and not offset["adopted"] and not done.notes
+    offset = next(p for p in done.proposals if p.key == "offset")
+    assert all(abs(value - zero) < 0.05 * one_g for value in offset.value.values())
+    assert "give a layout with offset" in offset.advice and not offset.adopted and not done.notes
     assert [c.offset for c in done.dataset.layout.channels] == [0, 0, 0]
     adopted = import_recordings(source, tmp_path / "ADOPTED", layout="accel-3")
-    assert "adopted" in adopted.proposals[0]["advice"] and adopted.proposals[0]["adopted"]
+    assert "adopted" in adopted.proposals[0].advice and adopted.proposals[0].adopted
     (note,) = (n for n in adopted.notes if isinstance(n, Sentence) and n.reason == "adopted")
-    assert adopted.proposals[0]["reason"] in note and note.values["settings"][0].startswith("offset: x ")
+    assert adopted.proposals[0].reason in note and note.values["settings"][0].startswith("offset: x ")
     for dataset in (adopted.dataset, open_dataset(tmp_path / "ADOPTED")):
-        assert [c.offset for c in dataset.layout.channels] == list(offset["value"].values())
+        assert [c.offset for c in dataset.layout.channels] == list(offset.value.values())
     assert not [p for p in import_recordings(source, tmp_path / "AGAIN", layout=adopted.dataset.layout).proposals
-                if p["key"] == "offset"]  # fmt: skip
+                if p.key == "offset"]  # fmt: skip
 
 
 def test_a_zero_that_cannot_be_known_is_not_proposed(tmp_path: Path) -> None:
     flat = import_recordings(analogue(tmp_path / "R", 330, 68, turned=False), tmp_path / "DS", layout="accel-3")
-    assert "offset" not in {p["key"] for p in flat.proposals}
+    assert "offset" not in {p.key for p in flat.proposals}
     right = import_recordings(analogue(tmp_path / "Q", 0, 8000), tmp_path / "DS2", layout="accel-3")
-    assert "offset" not in {p["key"] for p in right.proposals}
+    assert "offset" not in {p.key for p in right.proposals}
 
 
 def test_two_references_of_an_analogue_converter_are_named(tmp_path: Path, cli: Callable[..., Any]) -> None:
@@ -61,27 +62,27 @@ def test_two_references_of_an_analogue_converter_are_named(tmp_path: Path, cli: 
     adopted = import_recordings(source, tmp_path / "DS2", layout="accel-3")
     assert [c.offset for c in adopted.dataset.layout.channels] == [0, 0, 0], "no zero fits both"
     assert open_dataset(tmp_path / "DS2").layout.self_calibration == ("x", "y", "z")
-    assert adopted.proposals[0]["advice"] == 'adopted self_calibration = ["x", "y", "z"]'
+    assert adopted.proposals[0].advice == 'adopted self_calibration = ["x", "y", "z"]'
     wide = load_layout("accel-3")
     wide = replace(wide, channels=tuple(replace(c, valid_max=1e6) for c in wide.channels))
     kept = import_recordings(source, tmp_path / "WIDE", layout=wide)
-    assert kept.dataset.layout == wide and "give a layout" in kept.proposals[0]["advice"]
-    (found,) = (p for p in adopted.to_dict()["proposals"] if p["key"] in ("offset", "self_calibration"))
-    assert found["value"] == ["x", "y", "z"] and list(found["groups"]) == adopted.sensors
+    assert kept.dataset.layout == wide and "give a layout" in kept.proposals[0].advice
+    (found,) = (p for p in adopted.proposals if p.key in ("offset", "self_calibration"))
+    assert found.value == ["x", "y", "z"] and found.groups == adopted.sensors
     for group, zero, one_g, people in zip(
-        found["groups"], (330, 511), (68, 102), (["P0", "P1", "P2"], ["P3", "P4"]), strict=True
+        found.groups, (330, 511), (68, 102), (["P0", "P1", "P2"], ["P3", "P4"]), strict=True
     ):
-        assert [s["subject"] for s in group["sessions"]] == people and group["recognised"] == ""
-        for at in (group, *(s for s in group["sessions"] if s["zero"])):
-            assert at["one_g"] == pytest.approx(one_g, rel=0.1)
-            assert list(at["zero"].values()) == pytest.approx([zero] * 3, abs=0.1 * one_g)
-    assert any(s["zero"] for s in found["groups"][1]["sessions"])
+        assert [s.subject for s in group.sessions] == people and group.recognised == ""
+        for at in (group, *(s for s in group.sessions if s.zero)):
+            assert at.one_g == pytest.approx(one_g, rel=0.1)
+            assert list(at.zero.values()) == pytest.approx([zero] * 3, abs=0.1 * one_g)
+    assert any(s.zero for s in found.groups[1].sessions)
 
 
 def test_axes_that_are_turned_by_a_negative_scale_have_a_positive_g(tmp_path: Path) -> None:
     turned = replace(ACCEL, channels=tuple(replace(c, scale=-0.015) for c in ACCEL.channels))
     (sensor,) = import_recordings(analogue(tmp_path / "R", 330, 65), tmp_path / "DS", layout=turned).sensors
-    assert sensor["one_g"] == pytest.approx(0.98, rel=0.1)
+    assert sensor.one_g == pytest.approx(0.98, rel=0.1)
 
 
 def test_each_session_of_a_person_has_its_own_sensor(tmp_path: Path) -> None:
@@ -90,7 +91,7 @@ def test_each_session_of_a_person_has_its_own_sensor(tmp_path: Path) -> None:
     dataset.recordings = [
         replace(r, subject=f"Q{int(r.subject[1]) % 3}", session=r.subject) for r in dataset.recordings
     ]
-    groups = [[(s["subject"], s["session"]) for s in sensor.sessions] for sensor in find_sensors(dataset)]
+    groups = [[(s.subject, s.session) for s in sensor.sessions] for sensor in find_sensors(dataset)]
     assert groups == [[("Q0", "P0"), ("Q1", "P1"), ("Q2", "P2")], [("Q0", "P3"), ("Q1", "P4"), ("Q2", "P5")]]
 
 
@@ -112,8 +113,8 @@ def test_the_unit_that_1_g_tells_is_adopted_and_the_model_still_reads_the_device
         ACCEL, channels=tuple(replace(c, unit="g", valid_min=-8000, valid_max=8000) for c in ACCEL.channels)
     )
     milli = import_recordings(analogue(tmp_path / "R", 0, 1000), tmp_path / "DS", layout=given)
-    (unit,) = (p for p in milli.proposals if p["key"] == "unit")
-    assert unit["value"] == dict.fromkeys("xyz", "mg") and unit["adopted"]
+    (unit,) = (p for p in milli.proposals if p.key == "unit")
+    assert unit.value == dict.fromkeys("xyz", "mg") and unit.adopted
     adopted = milli.dataset.layout
     assert [c.unit for c in adopted.channels] == ["mg"] * 3
     check_layout(given, adopted)  # the device as its owner describes it, and the model made of the data set
@@ -172,9 +173,9 @@ def test_failed_readings_are_outside_the_valid_range_that_is_adopted(tmp_path: P
     found = [f for f in check(done.dataset).findings if f.check == "garbage" and f.recording]
     assert len(found) == 8 and all(f.severity == "error" for f in found)
     kept = import_recordings(tmp_path / "R" / "t.csv", tmp_path / "KEPT", layout=FORCE, adopt_proposals=False)
-    assert kept.dataset.layout == FORCE and "give a layout with valid_m" in kept.proposals[0]["advice"]
+    assert kept.dataset.layout == FORCE and "give a layout with valid_m" in kept.proposals[0].advice
     added = import_recordings(failing(tmp_path / "MORE", value), tmp_path / "KEPT", add_to=True)
-    assert {p["key"] for p in added.proposals} >= {"valid_min", "valid_max"} and added.dataset.layout == FORCE
+    assert {p.key for p in added.proposals} >= {"valid_min", "valid_max"} and added.dataset.layout == FORCE
     assert len(find_failed_readings(done.dataset)) == 0
 
 
@@ -202,7 +203,7 @@ def test_what_may_be_real_is_not_taken_for_failed(
     done = import_recordings(failing(tmp_path / "R", value, rows, every, times), tmp_path / "DS", layout=FORCE)
     assert done.dataset.layout == FORCE
     # What lasts is a touch or a disconnected sensor: the user decides.
-    assert {p["key"] for p in done.proposals} & {"valid_max"} == ({"valid_max"} if rows == 20 else set())
+    assert {p.key for p in done.proposals} & {"valid_max"} == ({"valid_max"} if rows == 20 else set())
 
 
 @pytest.mark.parametrize(
@@ -226,15 +227,15 @@ def test_single_rows_of_one_gesture_may_be_hits(tmp_path: Path, value: int, adop
     whole = {"step": 1.0, "valid_min": -(2**31), "valid_max": 2**31 - 1}
     layout = replace(FORCE, channels=tuple(replace(c, **whole) for c in FORCE.channels))
     done = import_recordings(tmp_path / "t.csv", tmp_path / "DS", layout=layout)
-    proposed = {p["key"]: p for p in done.proposals}
-    assert (done.dataset.layout != layout) == proposed["valid_max"]["adopted"] == adopted
-    assert ("most of them in tap, so they may be hits" in proposed["valid_max"]["reason"]) != adopted
+    proposed = {p.key: p for p in done.proposals}
+    assert (done.dataset.layout != layout) == proposed["valid_max"].adopted == adopted
+    assert ("most of them in tap, so they may be hits" in proposed["valid_max"].reason) != adopted
 
 
 def test_rate_gap_and_window_are_measured(tmp_path: Path) -> None:
     source = analogue(tmp_path / "R", 0, 8000, period_ms=80)
     done = import_recordings(source, tmp_path / "DS", layout="accel-3", adopt_proposals=False)
-    found = {p["key"]: p["value"] for p in done.proposals}
+    found = {p.key: p.value for p in done.proposals}
     assert found["rate_hz"] == 12.0 and found["gap_ms"] == pytest.approx(320, abs=8)
     assert "window_s" not in found  # the recordings last 3 s
     adopted = import_recordings(source, tmp_path / "DS2", layout="accel-3").dataset.layout
@@ -246,10 +247,10 @@ def test_the_real_recordings_need_nothing_but_a_window(real_data: Path, tmp_path
         done = import_recordings(real_data / source, tmp_path / layout)
         assert done.dataset.layout.name == layout and f"'{layout}'" in done.notes[0]
         assert not done.dataset.head.simulated
-        assert [p["key"] for p in done.proposals] == ["window_s"]
+        assert [p.key for p in done.proposals] == ["window_s"]
         (sensor,) = done.sensors
-        assert sensor["recognised"] == {"accel-3": "8192 counts a g", "phone-6": "m/s²"}[layout]
-        assert len({s["subject"] for s in sensor["sessions"]}) == len(done.dataset.subjects)
+        assert sensor.recognised == {"accel-3": "8192 counts a g", "phone-6": "m/s²"}[layout]
+        assert len({s.subject for s in sensor.sessions}) == len(done.dataset.subjects)
 
 
 def test_headers_that_fit_no_layout(tmp_path: Path, cli: Callable[..., Any]) -> None:

@@ -31,10 +31,10 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_recordings_come_back_and_give_the_same_windows(study: Path, tmp_path: Path, categorical: bool) -> None:
     path, count = scripts.save_windows(study, categorical=categorical)
     done = import_recordings(path, tmp_path / "DS")
-    assert (done.recordings, done.subjects, done.rejected) == (RECORDINGS, 0, [])
+    assert (done.recordings, done.subjects, done.rejected) == (RECORDINGS, 0, ())
     assert done.dataset.layout.name == "plush-windows"
     assert {"train", "test"} < {r.session for r in done.dataset.recordings}
-    assert sum("windows joined to 18 recordings" in w for w in done.to_dict()["warnings"]) == 1
+    assert sum("windows joined to 18 recordings" in w for w in done.messages) == 1
     whole = import_recordings(study / scripts.LABELLED, tmp_path / "whole", layout="plush-15").dataset
     rows = sorted((r.gesture, 50 * (r.rows // 50) if r.rows >= 250 else r.rows) for r in whole.recordings)
     assert sorted((r.gesture, r.rows) for r in done.dataset.recordings) == rows
@@ -57,7 +57,7 @@ def test_the_same_file_again_adds_nothing(study: Path, tmp_path: Path) -> None:
     path, _ = scripts.save_windows(study)
     import_recordings(path, tmp_path / "DS")
     again = import_recordings(path, tmp_path / "DS", add_to=True)
-    assert (again.recordings, again.added["recordings"]) == (RECORDINGS, 0)
+    assert (again.recordings, again.added_recordings) == (RECORDINGS, 0)
 
 
 def test_windows_are_joined_only_where_they_overlap() -> None:

@@ -91,7 +91,7 @@ def test_a_simulation_is_known_from_above_below_and_its_head(tmp_path: Path) -> 
     for number, source in enumerate((tmp_path / "a", deep, tmp_path / "DS" / "recordings")):
         done = import_recordings(source, tmp_path / f"again{number}", layout="plush-15")
         assert done.dataset.head.simulated, source
-        assert done.rejected == []
+        assert done.rejected == ()
     assert first.dataset.head.simulated
 
 
@@ -142,7 +142,7 @@ def test_a_mapping_of_files_that_are_not_there_is_said(tmp_path: Path) -> None:
     put(tmp_path / "src" / "x", "Shake", 1)
     (tmp_path / "map.csv").write_text("file,subject\nShake_1001_60.csv,ana\nShake_9_9.csv,ana\n")
     done = import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3", subjects=tmp_path / "map.csv")
-    assert done.to_dict()["warnings"][0] == "files that the mapping names do not exist (1): 'Shake_9_9.csv'"
+    assert done.messages[0] == "files that the mapping names do not exist (1): 'Shake_9_9.csv'"
 
 
 def test_upper_case_suffixes_and_odd_files_are_accounted_for(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_upper_case_suffixes_and_odd_files_are_accounted_for(tmp_path: Path) -> 
     put(src / "ana", "Shake", 2)
     (src / "linked").symlink_to(src / "ana")
     done = import_recordings(src, tmp_path / "DS", layout="accel-3")
-    assert sorted(r["file"] for r in done.rejected) == ["ana/shake_1001_60.csv", "linked"]
+    assert sorted(r.file for r in done.rejected) == ["ana/shake_1001_60.csv", "linked"]
     assert done.recordings == 2
     assert open_dataset(tmp_path / "DS").recordings == done.dataset.recordings
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.dataset.importing.build import ImportSummary
 from plushsense.dataset.importing.importers import import_recordings, preview_import
+from plushsense.dataset.importing.results import ImportResult
 from plushsense.scoring.splits import make_folds, parse_split
 from plushsense.windows.cut import WindowSpec, cut_windows
 from support import paper_scripts as scripts
@@ -20,7 +20,7 @@ Places = dict[tuple[str, int], tuple[str, str, int]]
 """Person, stream and row of each recording, by its gesture and the time of its first row."""
 
 
-def places(done: ImportSummary) -> Places:
+def places(done: ImportResult) -> Places:
     return {(r.gesture, r.epoch_ms): (r.subject, r.stream, r.stream_row + r.start) for r in done.dataset.recordings}
 
 
@@ -73,7 +73,7 @@ def test_what_is_in_no_stream_or_in_two_has_no_person(study: tuple[Path, Places]
     assert any(note.startswith("in none of the streams, so without a person (6): ") for note in done.notes)
     (two,) = (note for note in done.notes if note.startswith("in the streams of several people"))
     assert "without a person (6)" in two and "(P03, copy of P03)" in two
-    assert not [e for e in done.rejected if "fulldatastream" in e["file"]], "the streams of the study are imported"
+    assert not [e for e in done.rejected if "fulldatastream" in e.file], "the streams of the study are imported"
     assert done.streams == 4 and done.dataset.head.simulated
 
 

@@ -12,8 +12,9 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.importing.guessing import guess_pattern
-from plushsense.dataset.importing.importers import ImportSummary, import_recordings, preview_import
+from plushsense.dataset.importing.importers import import_recordings, preview_import
 from plushsense.dataset.importing.pattern import ImportPattern
+from plushsense.dataset.importing.results import ImportResult
 from plushsense.windows.anywhere import cut_anywhere
 from plushsense.windows.cut import WindowSpec, cut_windows
 
@@ -34,14 +35,14 @@ def joined(blocks: Sequence[list[str]], *between: str) -> list[str]:
     return [line for k, rows in enumerate(blocks) for line in ([*between] if k else []) + rows]
 
 
-def imported(tmp_path: Path, lines: Sequence[str], ends: str = "\n", head: str = HEAD, **keys: Any) -> ImportSummary:
+def imported(tmp_path: Path, lines: Sequence[str], ends: str = "\n", head: str = HEAD, **keys: Any) -> ImportResult:
     path = tmp_path / "src" / "P1" / "Pat.csv"
     path.parent.mkdir(parents=True)
     path.write_bytes(ends.join([head, *lines, ""]).encode())
     return import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**PATTERN | keys))
 
 
-def rows_of(done: ImportSummary) -> list[int]:
+def rows_of(done: ImportResult) -> list[int]:
     return [r.rows for r in sorted(done.dataset.recordings, key=lambda r: r.epoch_ms)]
 
 
@@ -57,14 +58,14 @@ def test_lines_between_blocks_of_rows_end_a_recording(tmp_path: Path, between: t
 
 def test_an_empty_line_after_every_row_is_a_doubled_line_end(tmp_path: Path) -> None:
     done = imported(tmp_path, block(60), ends="\r\r\n")
-    assert (rows_of(done), done.notes) == ([60], [])
+    assert (rows_of(done), done.notes) == ([60], ())
     done = imported(tmp_path / "2", joined([block(40), block(50)], ""), ends="\r\r\n")
     assert rows_of(done) == [40, 50]
 
 
 def test_the_pattern_can_name_the_lines_between_recordings(tmp_path: Path) -> None:
     done = imported(tmp_path, joined([block(40), block(50)], ""), between="none")
-    assert (rows_of(done), done.notes) == ([90], [])
+    assert (rows_of(done), done.notes) == ([90], ())
     lines = joined([block(40), block(50)], "START 2")
     done = imported(tmp_path / "2", lines, between="START.*")
     assert rows_of(done) == [40, 50]
@@ -133,9 +134,9 @@ def test_no_unit_is_guessed_from_a_clock_that_stands_still(tmp_path: Path, clock
     layout = {"rate_hz": 100.0, "channels": [{"name": "force", "unit": "", "kind": "sensor", "step": 0.5}]}
     given = ImportPattern(paths=("*.csv",), layout=layout)
     said = ["column 'timestamp' is read as milliseconds", "the clock stands still: all 60 rows have one time"]
-    assert_said(preview_import(tmp_path / "src", pattern=given).warnings, said)
+    assert_said(preview_import(tmp_path / "src", pattern=given).messages, said)
     done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=given)
-    assert_said(done.to_dict()["warnings"], said)
+    assert_said(done.messages, said)
     with pytest.raises(DatasetError, match="the clock stands still in 4 recordings"):
         cut_windows(done.dataset)
     with pytest.raises(DatasetError, match="the clock stands still in 4 recordings"):

@@ -14,8 +14,9 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError, MissingExtraError
 from plushsense.core.layouts import load_layout
 from plushsense.dataset.importing import table_files
-from plushsense.dataset.importing.importers import ImportSummary, import_recordings
+from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.importing.pattern import ImportPattern
+from plushsense.dataset.importing.results import ImportResult
 from plushsense.windows.anywhere import add_idle_gesture
 
 ACCEL = load_layout("accel-3")
@@ -30,7 +31,7 @@ def rows(subject: str, label: str, start: int, count: int, session: str = "1") -
     return [f"{subject},{session},{label},{(start + i) * 10},{i % 7},{i % 7 + 1},{-(i % 7)}" for i in range(count)]
 
 
-def got(done: ImportSummary) -> list[tuple[str, str, str, int]]:
+def got(done: ImportResult) -> list[tuple[str, str, str, int]]:
     return [(r.subject, r.session, r.gesture, r.rows) for r in done.dataset.recordings]
 
 
@@ -40,7 +41,7 @@ def test_runs_of_a_label_are_recordings(tmp_path: Path) -> None:
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
     assert got(done) == [("ana", "1", "Shake", 50), ("ana", "1", "Wave", 40), ("ben", "2", "Shake", 30)]
     assert [s.subject for s in done.dataset.streams] == ["ana"], "one gesture goes on where the other ends"
-    assert done.to_dict()["warnings"] == []
+    assert done.messages == ()
     wave = done.dataset.read(done.dataset.recordings[1])
     assert wave.values[:2].tolist() == [[0, 1, 0], [1, 2, -1]]
     assert wave.device_ms[:2].tolist() == [500, 510]
@@ -59,8 +60,8 @@ def test_labels_that_become_one_are_told(tmp_path: Path) -> None:
     composed, apart = "glāsts", unicodedata.normalize("NFD", "glāsts")
     lines = rows("ana", composed, 0, 50) + rows("ana", apart, 50, 50)
     same = import_recordings(table(tmp_path / "accents.csv", lines), tmp_path / "DS2", layout="accel-3")
-    assert {gesture for _, _, gesture, _ in got(same)} == {composed} and same.to_dict()["warnings"] == []
-    (said,) = done.to_dict()["warnings"]
+    assert {gesture for _, _, gesture, _ in got(same)} == {composed} and same.messages == ()
+    (said,) = done.messages
     assert "'swipe >' and 'swipe <' become one gesture, 'swipe _'" in said
 
 
@@ -164,7 +165,7 @@ def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
     done = import_recordings(table(tmp_path / "a.csv", lines), tmp_path / "DS", layout="accel-3")
     assert done.recordings == 1
     assert done.dataset.recordings[0].rows == 46
-    assert done.notes == [
+    assert list(done.notes) == [
         "a.csv: 1 row of another width than the header left out (the first: line 10: 'ana,1,Shake')",
         "a.csv: 2 rows without a number in every column left out (the first: line 7)",
         "a.csv: 1 row without a subject left out (the first: line 5)",
@@ -280,5 +281,5 @@ def test_a_table_that_grew_is_added(tmp_path: Path) -> None:
     table(path, rows("ana", "Shake", 0, 50) + rows("ana", "Wave", 200, 40) + rows("ben", "Wave", 0, 40))
     done = import_recordings(path, tmp_path / "DS", add_to=True)
     assert got(done) == [("ana", "1", "Shake", 50), ("ana", "1", "Wave", 40), ("ben", "1", "Wave", 40)]
-    assert (done.added["recordings"], done.already_there) == (2, 1)
-    assert done.rejected == []
+    assert (done.added_recordings, done.already_there) == (2, 1)
+    assert done.rejected == ()

@@ -55,12 +55,12 @@ def test_markers_cut_the_stream_into_recordings(
     assert wave.device_ms.tolist() == [53_200 + 10 * i for i in range(60)]
     origin = json.loads((tmp_path / "DS/streams/P03/S002-001/origin.json").read_text())
     assert (origin["source"], origin["stream"]) == (path.name, "toy")
-    assert done.rejected == []
+    assert done.rejected == ()
     unnamed = (
         f"{path.name}: stream 'toy' (#1): its channels have no names: its 3 values are taken for x, y, z, in this order"
     )
-    assert done.notes == ([] if labels else [unnamed])
-    assert done.warnings == []
+    assert done.notes == (() if labels else (unnamed,))
+    assert done.warnings == ()
     assert not list((tmp_path / "DS").rglob("*.xdf"))
 
 
@@ -91,7 +91,7 @@ def test_other_streams_are_named_and_two_that_fit_must_be_chosen(
     eeg = xdf_stream("EEG", [50.0, 50.1], [[0.0] * 32] * 2)
     path = xdf_writer(tmp_path / "sub-A.xdf", [accel(xdf_stream), eeg, said])
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
-    assert [e["file"] for e in done.left_out] == ["sub-A.xdf: stream 'EEG'"]
+    assert [e.file for e in done.left_out] == ["sub-A.xdf: stream 'EEG'"]
     twin = accel(xdf_stream)
     twin.name = "other"
     xdf_writer(path, [accel(xdf_stream), twin, said])
@@ -111,7 +111,7 @@ def test_files_in_folders_have_the_folders_person(tmp_path: Path, xdf_writer: Wr
     done = import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
     assert [(r.subject, r.session) for r in done.dataset.recordings] == [("ana", "one"), ("ana", "two"), ("ben", "1")]
     assert not any("files are the session" in note for note in done.notes)
-    assert [e["file"] for e in done.rejected] == ["ana/bad.xdf"]
+    assert [e.file for e in done.rejected] == ["ana/bad.xdf"]
     alone = tmp_path / "src" / "ana" / "one.xdf"
     with pytest.raises(FileFormatError, match="the person of 'one.xdf' is not known"):
         import_recordings(alone, tmp_path / "DS2", layout="accel-3")
@@ -197,8 +197,8 @@ def test_the_markers_are_the_texts_that_name_gestures(tmp_path: Path, xdf_writer
     path = xdf_writer(tmp_path / "sub-A.xdf", [toy, keys, prompts])
     expected = [("Hold strong", 150, 50), ("Tail pull", 50, 50)]
     done = import_recordings(path, tmp_path / "DS", layout="accel-3", gestures="plush-18")
-    assert (places(done), done.notes) == (expected, [])
-    assert [(e["file"], e["reason"]) for e in done.left_out] == [
+    assert (places(done), done.notes) == (expected, ())
+    assert [(e.file, e.reason) for e in done.left_out] == [
         ("sub-A.xdf: stream 'Keyboard'", "it is not the stream of markers")
     ]
     # Without a gesture set, the keys could be gestures too.
@@ -219,7 +219,7 @@ def test_the_studios_markers_come_first_and_its_mark_for_a_video_is_none(
     toy = accel(xdf_stream, labels=("x", "y", "z"))
     path = xdf_writer(tmp_path / "sub-A.xdf", [other, toy, studio])
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
-    assert (places(done), done.notes) == ([("Shake", 50, 50)], [])
+    assert (places(done), done.notes) == ([("Shake", 50, 50)], ())
 
 
 def test_numbers_are_gestures_only_if_they_are_chosen_or_named(
@@ -234,7 +234,7 @@ def test_numbers_are_gestures_only_if_they_are_chosen_or_named(
         import_recordings(path, tmp_path / "DS", layout="accel-3")
     done = import_recordings(path, tmp_path / "DS", layout="accel-3", columns={"markers": "codes"})
     assert places(done) == [("3", 50, 50), ("7", 150, 50)]
-    assert (done.left_out, ["2 markers end a recording" in note for note in done.notes]) == ([], [True])
+    assert (done.left_out, ["2 markers end a recording" in note for note in done.notes]) == ((), [True])
     (tmp_path / "set.toml").write_text(
         'name = "codes"\n[[gestures]]\nlabel = "Shake"\nlabels = ["3"]\n[[gestures]]\nlabel = "Wave"\nlabels = ["7"]\n'
     )
@@ -264,10 +264,10 @@ def test_streams_with_other_labels_are_not_the_toy(tmp_path: Path, xdf_writer: W
     unnamed.name = "unnamed"
     xdf_writer(path, [unnamed, accel(xdf_stream, labels=("x", "y", "z")), said])
     done = import_recordings(path, tmp_path / "two", layout="accel-3")
-    assert [(e["file"], e["reason"]) for e in done.left_out] == [
+    assert [(e.file, e.reason) for e in done.left_out] == [
         ("sub-A.xdf: stream 'unnamed'", "its channels have no names, and those of another stream have")
     ]
-    assert done.notes == []
+    assert done.notes == ()
 
 
 def test_streams_of_one_name(tmp_path: Path, xdf_writer: Writer, xdf_stream: Any) -> None:
@@ -320,7 +320,7 @@ def test_markers_without_a_recording_and_shortened_recordings_are_counted(
     )
     path = xdf_writer(tmp_path / "sub-A.xdf", [toy, said])
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
-    assert done.notes == [
+    assert list(done.notes) == [
         "sub-A.xdf: 1 markers name a gesture where the stream has no samples, and give no recording: 'Shake'",
         "sub-A.xdf: 2 recordings are cut short by the stream or a marker that names no gesture: 'Wave', 'Shake'",
     ]

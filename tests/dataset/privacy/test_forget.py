@@ -8,6 +8,7 @@ import shutil
 import tempfile
 import zipfile
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,9 @@ from plushsense.core.errors import DatasetError, ForgottenError
 from plushsense.core.files import temporary_folder, work_folder
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
+from plushsense.dataset import files as dataset_files
 from plushsense.dataset import index
-from plushsense.dataset.importing import adding, importers
+from plushsense.dataset.importing import build, importers
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import LOCK, MARKS, Mark, adding_locked, append_marks, read_marks
@@ -95,7 +97,7 @@ def test_stopped_between_the_last_line_and_the_end_it_is_buried_once(
 def test_who_comes_into_a_set_that_people_were_taken_out_of_is_named(folder: Path, tmp_path: Path) -> None:
     def told() -> list[str]:
         done = import_recordings(tmp_path / "src", folder, add_to=True)
-        return [w for w in done.to_dict()["warnings"] if "were removed" in w]
+        return [w for w in done.messages if "were removed" in w]
 
     (folder / "cache").mkdir(exist_ok=True)
     assert told() == []
@@ -286,12 +288,12 @@ def test_an_index_that_still_names_the_person_is_made_anew(folder: Path) -> None
     assert open_dataset(folder).subjects == ["P11", "P2"]
 
 
-@pytest.mark.parametrize("slow", ["build_index", "current_stamp"])
+@pytest.mark.parametrize(("module", "slow"), [(index, "build_index"), (dataset_files, "_index_hashes")])
 def test_who_opens_meanwhile_sees_and_writes_the_data_set_of_afterwards(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, slow: str
+    folder: Path, monkeypatch: pytest.MonkeyPatch, module: ModuleType, slow: str
 ) -> None:
     (folder / "index.json").unlink()
-    real, begun = getattr(index, slow), list[bool]()
+    real, begun = getattr(module, slow), list[bool]()
 
     def meanwhile(*args: Any) -> Any:
         found = real(*args)
@@ -300,7 +302,7 @@ def test_who_opens_meanwhile_sees_and_writes_the_data_set_of_afterwards(
             forget(folder, "P1")
         return found
 
-    monkeypatch.setattr(index, slow, meanwhile)
+    monkeypatch.setattr(module, slow, meanwhile)
     assert open_dataset(folder).subjects == ["P11", "P2"]
     assert not any("P1/" in (folder / name).read_text() for name in INDEX)
 
@@ -345,7 +347,7 @@ def test_an_import_holds_the_lock_while_it_writes(folder: Path, monkeypatch: pyt
         return write
 
     for name in ("write_people", "write_marks"):
-        monkeypatch.setattr(adding, name, spy(getattr(adding, name), name))
+        monkeypatch.setattr(build, name, spy(getattr(build, name), name))
     source = folder.parent / "more" / "P3"
     source.mkdir(parents=True)
     lines = (folder.parent / "src" / "P1" / f"Wave_{10**12}_50.csv").read_text().splitlines()

@@ -275,7 +275,7 @@ def test_rows_beyond_the_first_thousand_are_read_when_asked(package: PublishResu
     shutil.copytree(package.folder, root)
     quick, thorough = check_folder(root), check_folder(root, thorough=True)
     assert quick.problems == thorough.problems == []
-    said = next(v["looked_at"] for v in thorough.validators if v["validator"] == "croissant")
+    said = next(v.looked_at for v in thorough.validators if v.validator == "croissant")
     assert "3000 records of stream-samples" in said
     assert "1260 records of samples" in said
 

@@ -11,7 +11,7 @@ from plushsense.core.recorder_csv import Frames, read_recording, read_stream
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.dataset.publishing.contents import PublishOptions, public_codes
+from plushsense.dataset.publishing.contents import ContentsSpec, public_codes
 from plushsense.dataset.publishing.package import PublishResult
 from plushsense.dataset.store import Dataset
 from support.toys import KEY, made_of
@@ -68,7 +68,7 @@ def test_streams_with_a_label_on_every_row_and_a_wall_clock(tmp_path: Path) -> N
         assert after.device_ms.max() < 10**12
     assert not [p for p in (tmp_path / "out").rglob("*") if "2023" in p.name]
     with pytest.raises(DatasetError, match="cannot be published without streams"):
-        made_of(dataset, tmp_path / "other", PublishOptions(streams=False))
+        made_of(dataset, tmp_path / "other", ContentsSpec(streams=False))
 
 
 def test_delays_of_old_firmware_become_the_stream_s_clock(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_the_same_recording_twice_and_labels_that_need_care(tmp_path: Path) -> N
         (folder / f"{name}_{NOW}_30.csv").write_text(rows)
         (folder / f"{name}_{NOW + 1}_30.csv").write_text(rows)
     dataset = bring(tmp_path / "src", tmp_path / "DS", "accel-3")
-    back = sound(made_of(dataset, tmp_path / "out", PublishOptions(key=KEY)))
+    back = sound(made_of(dataset, tmp_path / "out", ContentsSpec(key=KEY)))
     assert len(back.recordings) == 6
     assert sum("the same content" in " ".join(r.flags) for r in back.recordings) == 3
 

@@ -14,7 +14,8 @@ from plushsense.dataset.about import Funding
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.publishing.checking import validate_package
-from plushsense.dataset.publishing.contents import PublishOptions
+from plushsense.dataset.publishing.contents import ContentsSpec
+from plushsense.dataset.publishing.keys import PublicationKey
 from plushsense.dataset.publishing.package import PublishResult, complete_head, publish
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import Dataset
@@ -23,7 +24,7 @@ from support.toys import KEY, SECRETS, made_of, make
 
 def test_every_validator_agrees(package: PublishResult) -> None:
     assert package.checked.problems == []
-    assert [v["validator"] for v in package.checked.validators] == [
+    assert [v.validator for v in package.checked.validators] == [
         "checksums",
         "data",
         "times",
@@ -148,13 +149,13 @@ def test_the_same_key_and_day_make_the_same_bytes(source: Dataset, package: Publ
     assert again.zip is not None
     assert package.zip is not None
     assert again.zip.read_bytes() == package.zip.read_bytes()
-    other = made_of(source, tmp_path / "other", PublishOptions(key=KEY[::-1]))
+    other = made_of(source, tmp_path / "other", ContentsSpec(key=PublicationKey(KEY.secret[::-1])))
     mine = {r.start_ms: r.epoch_ms for r in again.description.dataset.recordings}
     assert all(mine[r.start_ms] != r.epoch_ms for r in other.description.dataset.recordings)
 
 
 def test_columns_excluded_and_no_streams_on_request(source: Dataset, tmp_path: Path) -> None:
-    done = made_of(source, tmp_path / "out", PublishOptions(streams=False, excluded=True, columns=("hand",), key=KEY))
+    done = made_of(source, tmp_path / "out", ContentsSpec(streams=False, excluded=True, columns=("hand",), key=KEY))
     assert done.checked.problems == []
     assert "left" in (done.folder / "subjects.csv").read_text()
     assert not (done.folder / "data" / "streams").exists()
@@ -163,7 +164,7 @@ def test_columns_excluded_and_no_streams_on_request(source: Dataset, tmp_path: P
     assert sum(r.excluded for r in back.recordings) == 1
     assert "Left out: 5 session streams." in done.description.notes
     with pytest.raises(DatasetError, match="no column 'shoe' to publish"):
-        made_of(source, tmp_path / "other", PublishOptions(columns=("shoe",), key=KEY))
+        made_of(source, tmp_path / "other", ContentsSpec(columns=("shoe",), key=KEY))
     assert not (tmp_path / "other").exists()
 
 

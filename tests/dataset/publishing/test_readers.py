@@ -16,7 +16,7 @@ from plushsense.core.errors import DatasetError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
-from plushsense.dataset.publishing.contents import PublishOptions
+from plushsense.dataset.publishing.contents import ContentsSpec
 from plushsense.dataset.publishing.package import PublishResult
 from plushsense.dataset.publishing.texts import changed_text, is_misread, kind_of, label_prefix, public_label
 from plushsense.dataset.store import Dataset, PersonInfo, write_people
@@ -81,7 +81,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def package(source: Dataset, tmp_path_factory: pytest.TempPathFactory) -> PublishResult:
-    return made_of(source, tmp_path_factory.mktemp("out") / "package", PublishOptions(key=KEY, columns=("hand", "cm")))
+    return made_of(source, tmp_path_factory.mktemp("out") / "package", ContentsSpec(key=KEY, columns=("hand", "cm")))
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def test_a_value_of_a_person_that_would_be_changed_is_refused(tmp_path: Path) ->
     for value, other in (("007", ""), ("N/A", "left"), ("TRUE", "")):
         write_people(dataset.path, [PersonInfo("P1", more={"hand": value}), PersonInfo("P2", more={"hand": other})])
         with pytest.raises(DatasetError, match=re.escape(f"the hand '{value}'")) as refused:
-            made_of(dataset, tmp_path / "out", PublishOptions(columns=("hand",)))
+            made_of(dataset, tmp_path / "out", ContentsSpec(columns=("hand",)))
         assert "subjects.csv" in str(refused.value)
         assert [p.name for p in sorted(tmp_path.iterdir())] == ["DS", "src"]
 

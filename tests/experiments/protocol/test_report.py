@@ -3,52 +3,69 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pytest
 
 from plushsense.core.gestures import load_gestures
 from plushsense.experiments.protocol import report
 from plushsense.experiments.protocol.report import PAPER
-from plushsense.experiments.protocol.score import SYSTEMS
+from plushsense.experiments.protocol.score import (
+    SYSTEMS,
+    Aim,
+    FamilyConfusion,
+    ProtocolResult,
+    ScoredTrials,
+    StrayEvents,
+    SummaryRow,
+    TrialOutcome,
+    TrialSummary,
+)
+from plushsense.experiments.protocol.sittings import LeftOut
 
 TIMES = {"median": 0.013, "p90": 0.2}
+FIGURES = TrialSummary(
+    trials=45, activated=44, activation=0.9778, already=0, reaction_s=TIMES, within_200_ms=44, quick=0.9778, named=40,
+    gesture_activation=0.8889, gesture_s=TIMES, likelihood=0.834, gentle=45, called_negative=1, negative=0.0222,
+    called={"right": 40, "family": 3, "affect": 0, "wrong": 1, "unnamed": 1}, from_gate=0,
+)  # fmt: skip
 
 
-def row(group, system, **more):
-    figures = {
-        "trials": 45, "activated": 44, "named": 40, "activation": 0.9778, "gesture_activation": 0.8889,
-        "reaction_s": TIMES, "within_200_ms": 44, "likelihood": 0.834,
-        "gentle": 45, "called_negative": 1, "called": {"right": 40, "family": 3, "affect": 0, "wrong": 1, "unnamed": 1},
-    }  # fmt: skip
-    return {"group": group, "title": group.title(), "system": system} | figures | more
+def row(group, system, gesture=None, **more):
+    return SummaryRow(group, group.title(), gesture, system, replace(FIGURES, **more))
 
 
-def result(simulated=True, label="Tail hit 1", **more):
-    outcome = {"gesture": label, "group": "energetic", "system": "hybrid", "reaction_s": 0.1}
-    return {
-        "heading": "The protocol", "simulated": simulated, "about": [["People", "5"]], "said": ["No gate."], "left": [],
-        "counted": ["How it is counted."], "outcomes": [outcome, outcome | {"reaction_s": None}],
-        "rows": [
-            row("energetic", "hybrid", gentle=0, called_negative=0), row("fine", "rules"), row("fine", "cnn"),
-            row("taps", "cnn", activated=0, named=0, reaction_s={"median": None, "p90": None}, likelihood=None),
-            row("all", "cnn"),
-        ],
-        "by_gesture": [{"gesture": label} | row("energetic", "hybrid")],
-        "confusions": [
-            {"system": "cnn", "did": "Tail scratch", "called": "Tail tap", "trials": 2, "share": 0.13},
-            {"system": "cnn", "did": "Tail scratch", "called": None, "trials": 13, "share": 0.87},
-            {"system": "rules", "did": "Tail scratch", "called": "never shown", "trials": 1, "share": 1.0},
-        ],
-        "between": [
-            {"system": "cnn", "hours": 0.5, "positive": 3, "neutral": 9, "negative": 1, "none": 0,
-             "reactions_per_hour": 8.0, "negative_per_hour": 2.0},
-        ],
-        "aims": [
-            {"aim": "Fast", "measured": 0.9778, "unit": "share", "part": 44, "of": 45, "met": False},
-            {"aim": "Soon", "measured": 1.4, "unit": "s", "part": None, "of": 40, "met": True},
-            {"aim": "Open", "measured": None, "unit": "share", "part": 0, "of": 0, "met": None},
-        ],
-    } | more  # fmt: skip
+ROWS = (
+    row("energetic", "hybrid", gentle=0, called_negative=0), row("fine", "rules"), row("fine", "cnn"),
+    row("taps", "cnn", activated=0, named=0, reaction_s={"median": None, "p90": None}, likelihood=None),
+    row("all", "cnn"),
+)  # fmt: skip
+
+
+def result(simulated=True, label="Tail hit 1", rows=ROWS, **more):
+    outcome = TrialOutcome(
+        "virtual 1", "hybrid", label, "Tail hit", "energetic", "negative", 1, 2.0, 0.1, None, None, None, "unnamed",
+        None, False, False, None,
+    )  # fmt: skip
+    scored = ScoredTrials(
+        ("virtual 1",), 2, 1, ("rules", "cnn", "hybrid"), rows, (row("", "hybrid", label),),
+        (
+            FamilyConfusion("cnn", "Tail scratch", "Tail tap", 2, 0.13),
+            FamilyConfusion("cnn", "Tail scratch", None, 13, 0.87),
+            FamilyConfusion("rules", "Tail scratch", "never shown", 1, 1.0),
+        ),
+        (StrayEvents("cnn", 0.5, 3, 9, 1, 0, 8.0, 2.0),),
+        (outcome, replace(outcome, reaction_s=None)),
+    )  # fmt: skip
+    aims = (
+        Aim("Fast", 0.9778, "share", 44, 45, False),
+        Aim("Soon", 1.4, "s", None, 40, True),
+        Aim("Open", None, "share", 0, 0, None),
+    )
+    whole = ProtocolResult(
+        scored, "The protocol", simulated, (), aims, ("How it is counted.",), ("No gate.",), (("People", "5"),), "float"
+    )
+    return replace(whole, **more)
 
 
 def test_shares_bear_their_counts_and_do_not_round_a_miss_away():
@@ -75,9 +92,7 @@ def test_the_table_stands_beside_the_paper():
     assert (by["Taps", "Network"]["median"], by["Taps", "Network"]["likelihood"]) == ("—", "—")
     assert len(report.group_table(result()).columns) == 13
     assert "paper: time" in report.group_table(result()).text()
-    elsewhere = result()
-    for row in elsewhere["rows"]:
-        row["group"] = "other"
+    elsewhere = result(rows=tuple(replace(one, group="other") for one in ROWS))
     assert len(report.group_table(elsewhere).columns) == 10, "the paper has no such gestures"
 
 
@@ -117,7 +132,7 @@ def test_a_page_is_whole_and_says_what_it_is():
     assert "never shown" not in page
     assert not re.search(r'(src|href)="(?!data:)', page)
     assert "NOT met" in page
-    real = report.page(result(simulated=False, aims=[], left=[{"who": "P09", "why": "has no session stream"}]))
+    real = report.page(result(simulated=False, aims=(), left=(LeftOut("P09", "has no session stream"),)))
     assert "simulation" not in real.lower().replace("<!--", "")
     assert "P09 has no session stream" in real
     assert "What we aim at" not in real
@@ -126,7 +141,7 @@ def test_a_page_is_whole_and_says_what_it_is():
 def test_where_the_paper_has_nothing_its_columns_are_not_there():
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
-    other = result(rows=[row("fast", "cnn"), row("other", "cnn")], simulated=False, aims=[])
+    other = result(rows=(row("fast", "cnn"), row("other", "cnn")), simulated=False, aims=())
     page = report.page(other)
     assert "beside the paper" not in page
     assert "five new people" not in page

@@ -12,12 +12,13 @@ from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.devices.base import Frame
 from plushsense.experiments.protocol.score import (
+    FamilyConfusion,
     SystemOutput,
     aims,
     confusions,
     group_of,
-    run,
     score,
+    score_sittings,
     summary,
     system_outputs,
     windows_of,
@@ -63,9 +64,9 @@ def test_a_blow_is_answered_from_the_blow_on():
     blow = trial("Tail hit 1", 10.0, 11.0, onset=10.3)
     (one,), _ = outcomes([blow], event("begun", 1, 10.31, "negative", source="gate"))
     assert (one.reaction_s, one.source, one.judged, one.called) == (0.01, "gate", "unnamed", None)
-    assert summary([one])["within_200_ms"] == 1
+    assert summary([one]).within_200_ms == 1
     (late,), _ = outcomes([blow], event("begun", 1, 10.51, "negative"))
-    assert summary([late])["within_200_ms"] == 0
+    assert summary([late]).within_200_ms == 0
 
 
 def test_what_is_said_first_counts_even_when_it_is_put_right_later():
@@ -106,7 +107,7 @@ def test_a_gentle_gesture_is_called_negative_only_while_it_lasts():
         (one,), _ = outcomes([tap], event("begun", 1, t, "negative"))
         assert one.negative == called
     (blow,), _ = outcomes([trial("Tail hit 1", 10.0, 11.0)], event("begun", 1, 10.1, "negative"))
-    assert summary([blow])["called_negative"] == 0, "a blow is rightly called so"
+    assert summary([blow]).called_negative == 0, "a blow is rightly called so"
 
 
 def test_times_of_trials_do_not_overlap_and_rest_is_none():
@@ -140,14 +141,14 @@ def test_a_summary_is_of_all_trials_and_its_times_of_those_that_were_answered():
         said.append(event("ended", n, 10.0 * n + 3.0, "negative", "Tail hit 1"))
     found, _ = outcomes(trials, *said)
     row = summary(found)
-    assert (row["trials"], row["activated"], row["activation"]) == (4, 3, 0.75)
-    assert (row["within_200_ms"], row["quick"]) == (1, 0.25)
-    assert row["reaction_s"] == {"median": 0.3, "p90": pytest.approx(0.94)}
-    assert row["called"] == {"right": 3, "family": 0, "affect": 0, "wrong": 0, "unnamed": 1}
-    assert row["likelihood"] is None
+    assert (row.trials, row.activated, row.activation) == (4, 3, 0.75)
+    assert (row.within_200_ms, row.quick) == (1, 0.25)
+    assert row.reaction_s == {"median": 0.3, "p90": pytest.approx(0.94)}
+    assert row.called == {"right": 3, "family": 0, "affect": 0, "wrong": 0, "unnamed": 1}
+    assert row.likelihood is None
     assert confusions(found) == [
-        {"system": "cnn", "did": "Tail hit", "called": "Tail hit", "trials": 3, "share": 0.75},
-        {"system": "cnn", "did": "Tail hit", "called": None, "trials": 1, "share": 0.25},
+        FamilyConfusion("cnn", "Tail hit", "Tail hit", 3, 0.75),
+        FamilyConfusion("cnn", "Tail hit", None, 1, 0.25),
     ]
 
 
@@ -156,16 +157,15 @@ def test_aims_are_met_missed_or_open():
     kind = [trial("Back stroke 1", 30.0, 33.0), trial("Ear scratch 1", 40.0, 43.0)]
 
     def told(*events, system="hybrid"):
-        found, _ = outcomes(blows + kind, *events, system=system)
-        return [o.to_dict() for o in found]
+        return outcomes(blows + kind, *events, system=system)[0]
 
     good = told(*(event("begun", n, t + 0.1, a) for n, t, a in (
         (1, 10, "negative"), (2, 20, "negative"), (3, 30, "positive"), (4, 40, "positive"))))  # fmt: skip
     rules = told(event("begun", 1, 41.0), system="rules")
-    assert [a["met"] for a in aims({"outcomes": good + rules})] == [True, True, True, False]
+    assert [a.met for a in aims(good + rules)] == [True, True, True, False]
     bad = told(event("begun", 1, 11.0, "negative"), event("begun", 2, 31.0, "negative"), event("begun", 3, 42.0))
-    assert [a["met"] for a in aims({"outcomes": bad})] == [False, False, False, None]
-    assert [a["met"] for a in aims({"outcomes": []})] == [None] * 4
+    assert [a.met for a in aims(bad)] == [False, False, False, None]
+    assert [a.met for a in aims([])] == [None] * 4
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +185,7 @@ def model():
 @pytest.fixture(scope="module")
 def sitting(model):
     labels = ("Tail hit 1", "Back stroke 1")
-    return next(iter(virtual_sittings([1001], 2, 1, model.layout, gestures=labels)))
+    return virtual_sittings([1001], 2, 1, model.layout, gestures=labels)[0].play()
 
 
 def test_each_system_hears_the_very_events_of_the_live_reader(model, sitting):
@@ -220,15 +220,15 @@ def test_a_run_adds_up_and_rules_are_whatever_is_plugged_in(model, sitting):
         return [event("begun", 1, blow.onset_s + 0.15, "negative", source="gate")]
 
     told = []
-    result = run([sitting], model, rules, lambda done, of: told.append((done, of)), 1)
+    scored = score_sittings([sitting], model, rules, lambda at: told.append((at.done, at.total)))
     assert told == [(1, 1)]
-    assert [s["system"] for s in result["systems"]] == ["rules", "cnn", "hybrid"]
-    assert (result["trials"], result["gestures"], len(result["outcomes"])) == (2, 2, 6)
-    rows = {(row["group"], row["system"]): row for row in result["rows"]}
-    assert rows["energetic", "rules"]["reaction_s"]["median"] == pytest.approx(0.15, abs=1e-3)
-    assert rows["broad", "rules"]["activated"] == 0
+    assert scored.systems == ("rules", "cnn", "hybrid")
+    assert (scored.trials, scored.gestures, len(scored.outcomes)) == (2, 2, 6)
+    rows = {(row.group, row.system): row.figures for row in scored.rows}
+    assert rows["energetic", "rules"].reaction_s["median"] == pytest.approx(0.15, abs=1e-3)
+    assert rows["broad", "rules"].activated == 0
     # A blow on a table is what the hand-made gate is for.
-    assert rows["energetic", "hybrid"]["within_200_ms"] == 1
-    assert rows["all", "hybrid"]["trials"] == 2
-    for row in result["rows"]:
-        assert sum(row["called"].values()) == row["trials"]
+    assert rows["energetic", "hybrid"].within_200_ms == 1
+    assert rows["all", "hybrid"].trials == 2
+    for row in rows.values():
+        assert sum(row.called.values()) == row.trials

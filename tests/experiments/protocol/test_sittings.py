@@ -29,15 +29,15 @@ LABELS = ("Back stroke 2", "Tail hit 1", "Tail hit 2", "Tail pull")
 
 
 def sitting(**options):
-    return next(iter(virtual_sittings([1001], 3, 3, PLUSH, gestures=LABELS, **options)))
+    return virtual_sittings([1001], 3, 3, PLUSH, gestures=LABELS, **options)[0].play()
 
 
 def test_a_virtual_sitting_is_the_same_each_time_and_another_for_each_person_and_seed():
     one, same = sitting(), sitting()
     assert np.array_equal(one.frames.values, same.frames.values)
     assert one.trials == same.trials
-    other = next(iter(virtual_sittings([1002], 3, 3, PLUSH, gestures=LABELS)))
-    seeded = next(iter(virtual_sittings([1001], 4, 3, PLUSH, gestures=LABELS)))
+    other = virtual_sittings([1002], 3, 3, PLUSH, gestures=LABELS)[0].play()
+    seeded = virtual_sittings([1001], 4, 3, PLUSH, gestures=LABELS)[0].play()
     assert len({len(s.frames) for s in (one, other, seeded)}) == 3
     assert [(t.label, t.repetition) for t in one.trials] == [(label, n) for label in LABELS for n in (1, 2, 3)]
     assert sum(np.diff(one.frames.device_ms) > 15), "lines are lost as over the air"
@@ -112,7 +112,7 @@ def recorded(tmp_path_factory):
 def test_recorded_trials_lie_where_the_recordings_are_in_the_stream(recorded):
     sittings, left = recorded_sittings(recorded, ["P01", "P02", "P03"], SET)
     assert [s.who for s in sittings] == ["P01"]
-    assert [(e["who"], e["why"].partition(",")[0]) for e in left] == [
+    assert [(e.who, e.why.partition(",")[0]) for e in left] == [
         ("P02", "has no session stream"),
         ("P03", "has a session stream"),
     ]

@@ -118,7 +118,7 @@ def made_bundle() -> Bundle:
 
 def test_the_events_of_a_bundle_have_the_scores_of_the_bundle(dataset: Dataset, tmp_path: Path) -> None:
     bundle, file = made_bundle(), tmp_path / "events.csv"
-    own = stream_eval(dataset.path, bundle, events=file)
+    own = stream_eval(dataset.path, bundle, events=file).to_json()
     with file.open(newline="") as text:
         rows = list(csv.DictReader(text))
     # There is everything that a bundle reports: events with affect and gesture at once, one after the other, and alone.
@@ -128,7 +128,7 @@ def test_the_events_of_a_bundle_have_the_scores_of_the_bundle(dataset: Dataset, 
         (False, False),
     }
     assert own["gate_events"] > 0 and own["hits"] > 0 and own["insertions"] > 0
-    found = score_predictions(dataset.path, file, classes="all")
+    found = score_predictions(dataset.path, file, classes="all").to_json()
     assert_same(own, found)
     assert list(found["people"]) == ["P1", "P2", "P3", "P4"]
     for person, row in own["people"].items():
@@ -149,8 +149,8 @@ def assert_same(own: dict[str, Any], found: dict[str, Any]) -> None:
 def test_a_stream_without_events_stays_in_the_file(dataset: Dataset, tmp_path: Path) -> None:
     silent = replace(made_bundle(), decision=DecideSpec(enter_affect=2.0, least_s=60.0).to_dict())
     file = tmp_path / "events.csv"
-    own = stream_eval(dataset.path, silent, events=file)
-    found = score_predictions(dataset.path, file, classes="all")
+    own = stream_eval(dataset.path, silent, events=file).to_json()
+    found = score_predictions(dataset.path, file, classes="all").to_json()
     assert own["events"] == 0 and own["truths"] == found["deletions"] == 16
     assert_same(own, found)
 
@@ -163,7 +163,7 @@ def test_true_gestures_as_predictions_are_all_hits(dataset: Dataset, tmp_path: P
             f"{stream.id},{t.start_s},{t.stop_s},{t.label},{0.2 if t.label == 'Slow' else 0.7}" for t in truth.truths
         ]
     file = written(tmp_path / "p.csv", *rows)
-    found = score_predictions(dataset.path, file, classes="all")
+    found = score_predictions(dataset.path, file, classes="all").to_json()
     assert (found["f1"], found["insertions"], found["latency_s"]["median"]) == (1.0, 0, 0.0)
     assert found["form"] == "events" and found["streams"] == [s.id for s in dataset.streams]
     assert "on whom their system was trained" in found["note"]
@@ -171,32 +171,34 @@ def test_true_gestures_as_predictions_are_all_hits(dataset: Dataset, tmp_path: P
         {"threshold": 0.2, "recall": 1.0, "f1": 1.0, "false_events_per_hour": 0.0},
         {"threshold": 0.7, "recall": 0.5, "f1": pytest.approx(2 / 3), "false_events_per_hour": 0.0},
     ]
-    above = score_predictions(dataset.path, file, classes="all", threshold=0.5)
+    above = score_predictions(dataset.path, file, classes="all", threshold=0.5).to_json()
     assert above["recall"] == 0.5 and above["curve"] == found["curve"]
     # Without the gesture of lower scores among the classes, its recordings are no longer true gestures.
     slow = [row for row in rows if not row.count(",Slow,")]
-    fewer = score_predictions(dataset.path, written(tmp_path / "q.csv", *slow), classes=["Rest", "Fast"])
+    fewer = score_predictions(dataset.path, written(tmp_path / "q.csv", *slow), classes=["Rest", "Fast"]).to_json()
     assert fewer["truths"] == 8 and fewer["f1"] == 1.0 and fewer["classes"] == ["Rest", "Fast"]
 
 
 def test_only_streams_in_the_file_or_of_people_asked_for_are_scored(dataset: Dataset, tmp_path: Path) -> None:
     said: list[str] = []
     file = written(tmp_path / "p.csv", "t,label,subject", "1.0,,P1", "2.0,Slow,P2")
-    found = score_predictions(dataset.path, file, warn=said.append)
+    found = score_predictions(dataset.path, file, warn=said.append).to_json()
     assert list(found["people"]) == ["P1", "P2"] and found["people"]["P1"]["deletions"] == 4
     assert found["curve"] == [] and found["form"] == "decisions"
     assert any("not scored" in s and "P3/fulldatastream, P4/fulldatastream" in s for s in said)
-    asked = score_predictions(dataset.path, file, subjects=["P2", "P3"])
+    asked = score_predictions(dataset.path, file, subjects=["P2", "P3"]).to_json()
     assert list(asked["people"]) == ["P2", "P3"] and asked["people"]["P3"]["deletions"] == 4
     # A column for the stream is not needed if there is only one.
-    alone = score_predictions(dataset.path, written(tmp_path / "q.csv", "t,label", "2.0,Slow"), subjects=["P2"])
+    alone = score_predictions(
+        dataset.path, written(tmp_path / "q.csv", "t,label", "2.0,Slow"), subjects=["P2"]
+    ).to_json()
     assert alone["events"] == 1 and alone["streams"] == ["P2/fulldatastream"]
 
 
 def test_a_folder_of_the_recorder_can_be_scored(dataset: Dataset, recordings: Path, tmp_path: Path) -> None:
     shutil.copytree(recordings / "P2", tmp_path / "visit" / "P2")
     file = written(tmp_path / "p.csv", "t,stop,label", "4.0,5.0,Fast")
-    found = score_predictions(tmp_path / "visit", file)
+    found = score_predictions(tmp_path / "visit", file).to_json()
     # Gestures are inferred from the labels, so that rest is a gesture, too.
     assert found["events"] == 1 and found["truths"] == 6
 

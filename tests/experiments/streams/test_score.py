@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset.importing.importers import import_recordings
@@ -55,87 +54,18 @@ from plushsense.experiments.streams.systems import (
 )
 from plushsense.jobs.journal import Journal
 from plushsense.jobs.pool import JobsSpec
-from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
-from plushsense.runtime.decisions import DecideSpec, Rules, argmax_spec
-from plushsense.runtime.events import ONE, EventSettings
-from plushsense.runtime.fixed import smoothing_weight
-from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
-from plushsense.runtime.trace import Part, Trace, TraceReplayer, replay, reported_events, trace_of
+from plushsense.runtime.decisions import DecideSpec, argmax_spec
+from plushsense.runtime.gate import GateSettings
+from plushsense.runtime.replay import TraceReplayer
+from plushsense.runtime.trace import trace_of
 from plushsense.scoring.events import ErrorCosts, Interval
 from plushsense.windows.clock import row_times_us
 from plushsense.windows.features import Scaler
+from support.made_traces import ARCH, GATE, GESTURES, HIT, HUG, REST, SQUEEZE, STEP_S, made_trace
 
 ACCEL = load_layout("accel-3")
-GESTURES = GestureSet(
-    "touches",
-    (
-        Gesture("Rest", "neutral", idle=True),
-        Gesture("Hug", "positive", "Hold"),
-        Gesture("Squeeze", "positive", "Hold"),
-        Gesture("Hit", "negative", energetic=True),
-    ),
-)
-REST, HUG, SQUEEZE, HIT = range(4)
-ARCH = Arch.parse("5d1_4d3", (6, 5), channels=3, classes=4, padding="stream", window=48, step=5)
-STEP_S = 0.05
-
-
-def made_trace(logits: list[np.ndarray], inputs: np.ndarray | None = None, suspect: tuple[int, ...] = ()) -> Trace:
-    """A stream that a network answered with ``logits``, a part each; one of None is too short for any answer."""
-    parts, now = [], 0
-    for rows in logits:
-        n = len(rows)
-        samples = ARCH.span + ARCH.step * (n - 1) + 3 if n else ARCH.span - 6
-        values = np.zeros((samples, 3), dtype=np.int64) if inputs is None else inputs[:samples]
-        doubt = np.zeros(samples, dtype=np.bool_)
-        doubt[[at for at in suspect if at < samples]] = True
-        parts.append(Part(now, now + (samples - 1) * 10_000 + 3_000, values, doubt, rows.astype(np.int64)))
-        now += samples * 10_000 + 500_000
-    return Trace(ARCH, 10_000, GESTURES, 0, tuple(parts), 0)
-
-
-GATE = GateSettings((Signal(JERK, (0, 1, 2), lag=2, floor=40),), (Rule((Term(0, 40),), 3, HIT, deaf=9),))
-
-
-@pytest.mark.parametrize("seed", range(40))
-def test_quick_replays_give_the_events_of_the_live_loop(seed: int) -> None:
-    draw = np.random.default_rng(seed)
-    # Slow swings, so that something lasts; and a noisy part.
-    parts = [np.cumsum(draw.normal(0, swing, (n, 4)), axis=0) for swing, n in ((120, 300), (400, 80), (0, 0), (60, 40))]
-    inputs = np.cumsum(draw.integers(-9, 10, (1600, 3)), axis=0) + 400 * (draw.random((1600, 1)) > 0.99)
-    trace = made_trace(parts, inputs, tuple(draw.integers(0, 900, 40).tolist()))
-    counts = {name: int(draw.integers(low, 9)) for low, name in ((1, "least"), (1, "switch"), (1, "end"), (0, "hold"))}
-    settings = EventSettings(
-        enter=int(draw.integers(0, ONE)),
-        leave=int(draw.integers(0, ONE)),
-        enter_affect=int(draw.integers(ONE // 3, ONE + 2)),
-        leave_affect=int(draw.integers(0, ONE)),
-        known=int(draw.integers(-2000, 2000)),
-        rest=int(draw.integers(0, 20)),
-        wait=int(draw.integers(0, 20)),
-        **counts,
-    )
-    listener = TraceReplayer(trace)
-    for gate in (GateSettings(), GATE):
-        for smoothing_s in (0.0, 0.2):
-            rules, weight = Rules(settings, gate), smoothing_weight(smoothing_s, STEP_S)
-            assert listener.replay(rules, weight) == list(replay(trace, rules, weight).updates)
-
-
-def test_replays_of_a_real_network_on_a_troubled_stream_are_the_same() -> None:
-    frames = troubled()
-    listener = TraceReplayer(trace_of(frames, bundle()))
-    assert len(listener.trace.parts) > 2
-    for spec in (argmax_spec(), DecideSpec(enter=0.3, leave=0.2), replace(argmax_spec(0.1), gate=GATE, end_s=0.4)):
-        weight = smoothing_weight(spec.smoothing_s, listener.step_s)
-        rules = spec.rules(listener.step_s)
-        updates = listener.replay(rules, weight)
-        assert updates == list(replay(listener.trace, rules, weight).updates) and updates
-        events = listener.events(spec)
-        assert events == reported_events(updates)
-        assert all(e.start_s <= e.named_s <= e.stop_s for e in events)
 
 
 def troubled() -> Frames:
@@ -438,7 +368,8 @@ def test_folds_keep_people_apart_and_are_resumed(dataset: Dataset, tmp_path: Pat
     assert plain["truths"] == 12 and plain["hits"] + plain["deletions"] == 12
     assert [p["subject"] for p in plain["people"]] == sorted(tested)
     assert sum(p["truths"] for p in plain["people"]) == 12
-    alone = pooled_scores(people_scores(model_events(dataset, bundle(), tested, argmax_spec(0.0)), GESTURES))
+    scores = people_scores(model_events(dataset, bundle(), tested, argmax_spec(0.0)), GESTURES)
+    alone = pooled_scores(scores.values()).to_dict()
     for name in ("events", "hits", "insertions", "fragmentations", "merges", "latency_s", "cost_per_truth"):
         assert alone[name] == plain[name], name
     assert table["reference"] is None and table["at_recall"] == []

@@ -16,10 +16,10 @@ from plushsense.experiments.streams.run import TrainStreams, recipes_for
 from plushsense.experiments.streams.score import PeopleFold
 from plushsense.experiments.streams.systems import ANYWHERE, WINDOWS
 from plushsense.training import fit as fitting
-from plushsense.trials.budget import make_network
-from plushsense.trials.estimate import preview_evaluation
 from plushsense.windows.cut import WindowSet
+from plushsense.workflow.budget import make_network
 from plushsense.workflow.config import from_settings
+from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.preparation import outside_streams, prepare
 
 

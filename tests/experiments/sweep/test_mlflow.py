@@ -26,18 +26,18 @@ def test_each_finished_trial_is_logged_once(tmp_path: Path, mlflow_here: None) -
         status=waiting.then(polars.lit("waiting")).otherwise("status"),
     ).write_parquet(folder / "trials.parquet")
     first = export_trials(read_sweep(folder), tmp_path / "store")
-    assert (first["new"], first["before"]) == (3, 0)
+    assert (first.new, first.before) == (3, 0)
     again = export_trials(read_sweep(folder), tmp_path / "store")
-    assert (again["new"], again["before"]) == (0, 3)
+    assert (again.new, again.before) == (0, 3)
     whole.write_parquet(folder / "trials.parquet")
     import mlflow
 
-    client = mlflow.MlflowClient(tracking_uri=first["uri"])
-    experiment = client.get_experiment_by_name(first["experiment"])
+    client = mlflow.MlflowClient(tracking_uri=first.uri)
+    experiment = client.get_experiment_by_name(first.experiment)
     last = whole["trial"][0]
     half = client.create_run(experiment.experiment_id, tags={TRIAL: last})
     grown = export_trials(read_sweep(folder), tmp_path / "store")
-    assert (grown["new"], grown["before"]) == (1, 3), "a run that was left unfinished is completed, not logged twice"
+    assert (grown.new, grown.before) == (1, 3), "a run that was left unfinished is completed, not logged twice"
     runs = client.search_runs([experiment.experiment_id])
     assert sorted(r.data.tags[TRIAL] for r in runs) == sorted(whole["trial"])
     assert client.get_run(half.info.run_id).info.status == "FINISHED"

@@ -8,6 +8,7 @@ import math
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.experiments.sweep import figures as sweep_figures
 from plushsense.experiments.sweep import report as sweep_report
 from plushsense.experiments.sweep import tables as sweep_tables
+from plushsense.experiments.sweep.grid import CHOSEN, SECOND
 from plushsense.experiments.sweep.report import confusion_words, sections_of, write_sweep_report
 from plushsense.experiments.sweep.results import read_sweep
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS
@@ -36,6 +38,9 @@ ONE = {
     "labels": ("Rest", "Slow & low", "<script>$\\frac"),
     "channels": 4,
 }
+
+
+ONE_TRIAL: dict[str, Any] = {"archs": ("250",), "filter_sets": ((4, 6, 8, 8),), "epochs": (5,), "batches": ("64",)}
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +85,9 @@ class Written:
 
 def write_report(folder: Path, page: Path | None = None) -> Written:
     made = write_sweep_report(folder, page)
-    beside = Path(made["files"])
+    beside = made.files
     files = sorted(path for path in beside.iterdir() if path.name != "README.txt")
-    return Written(Path(made["report"]), beside, files, made["done"], made["trials"])
+    return Written(made.report, beside, files, made.done, made.trials)
 
 
 def test_acr_is_the_papers():
@@ -152,8 +157,6 @@ def test_table4_has_maxima_means_and_the_papers_row(tmp_path):
     assert [[row[i] for i in papers] for row in table.cells()[1:]] == [["—"] * 5] * 3, "not printed there: a dash"
     assert "windows:file-order" in " ".join(table.notes) and "75.0 %" in " ".join(table.notes)
     assert [r["above"] for r in table.rows] == ["yes", "no", "no", "no"], "0.70 is not above 70 %"
-    assert [r["above"] for r in sweep_tables.table4(sweep, threshold=0.2).rows] == ["yes"] * 4
-    assert len(sweep_tables.table4(sweep, top=1).rows) == 2
     assert "1 of 4 scored networks" in " ".join(table.notes)
 
 
@@ -177,10 +180,10 @@ def test_table4_has_every_network_that_the_paper_printed(whole):
 
 def test_architectures_over_all_and_over_one_filter_set(tmp_path):
     sweep = read_sweep(known(tmp_path / "S", SCORES))
-    rows = {r["arch"]: r for r in sweep_tables.architectures(sweep)}
-    assert rows["250"]["highest"] == 0.7 and rows["250"]["mean"] == pytest.approx((2.2 + 1.2) / 8)
-    assert rows["14d1_39d2_41d4"]["trials"] == 7 and rows["14d1_39d2_41d4"]["parameters"] == 13262
-    assert {r["arch"]: r["mean"] for r in sweep_tables.architectures(sweep, "4/6/8/8")}["250"] == pytest.approx(0.55)
+    rows = {r.arch: r for r in sweep_tables.architectures(sweep)}
+    assert rows["250"].highest == 0.7 and rows["250"].mean == pytest.approx((2.2 + 1.2) / 8)
+    assert rows["14d1_39d2_41d4"].trials == 7 and rows["14d1_39d2_41d4"].parameters == 13262
+    assert {r.arch: r.mean for r in sweep_tables.architectures(sweep, "4/6/8/8")}["250"] == pytest.approx(0.55)
 
 
 def test_the_effect_is_over_networks_that_have_every_schedule(tmp_path):
@@ -195,19 +198,15 @@ def test_the_effect_is_over_networks_that_have_every_schedule(tmp_path):
     assert "not to be compared" in odd.notes[0] and len(odd.rows) == 3
 
 
-def test_batches_and_filter_sets_are_in_order_of_size(whole):
+def test_the_fronts_hold_what_no_network_beats(whole):
     sweep = read_sweep(whole)
     assert sweep_tables.batches(sweep) == ["64", "256", "full"]
     assert sweep.filter_sets == ["/".join(map(str, f)) for f in PAPER_FILTERS]
-
-
-def test_the_fronts_hold_what_no_network_beats(whole):
-    sweep = read_sweep(whole)
     points = sweep_tables.pareto_points(sweep, "parameters")
     assert len(points) == 52
-    edge = [(p["value"], p["macro_f1"]) for p in points if p["front"]]
+    edge = [(p.value, p.macro_f1) for p in points if p.front]
     assert edge == sorted(edge) and [f for _, f in edge] == sorted(f for _, f in edge)
-    assert max(p["macro_f1"] for p in points) == edge[-1][1] and min(p["value"] for p in points) == edge[0][0]
+    assert max(p.macro_f1 for p in points) == edge[-1][1] and min(p.value for p in points) == edge[0][0]
 
 
 def test_labels_of_a_front_cover_neither_each_other_nor_the_edge(whole):
@@ -229,7 +228,7 @@ def test_the_confusion_is_by_affect_and_counted(tmp_path):
     head["confusions"][trial] = [[8, 1, 1], [0, 9, 1], [0, 0, 10]]
     (folder / "sweep.json").write_text(json.dumps(head))
     sweep = read_sweep(folder)
-    row = sweep.chosen
+    row = sweep.best_of(*CHOSEN)
     assert row is not None
     said = confusion_words(sweep, row)
     assert "27 of 30 windows right (90.0 %)" in said and "10.0 % as one of another affect" in said
@@ -249,7 +248,7 @@ def test_the_confusions_of_every_kept_network_are_files(tmp_path, monkeypatch):
     (folder / "sweep.json").write_text(json.dumps(head))
     sweep = read_sweep(folder)
     monkeypatch.setattr(sweep_report, "_MATRICES", 2)
-    section = sweep_report._confusions(sweep, [t for t in (sweep.chosen, sweep.second) if t])
+    section = sweep_report._confusions(sweep, [t for t in (sweep.best_of(*CHOSEN), sweep.best_of(*SECOND)) if t])
     drawn = [d.name for d in (*section.drawings, *section.more_drawings)]
     assert drawn[0].startswith("figure-10-confusion-14d1_39d2_41d4-8-12-16-")
     assert drawn[1].startswith("figure-11-confusion-19d1_19d2_19d4_17d8-4-6-8-8-")
@@ -286,14 +285,13 @@ def test_the_page_is_complete_marked_and_beside_its_files(tmp_path):
     ]
     assert len(scores) > 10 and all("LEAKY" in h and "SIMULATION" in h for h in scores)
     names = {f.name for f in made.files}
-    assert {"table-3.csv", "table-4.csv", "acr.csv", "effect.csv", "pareto.csv"} <= names
+    assert {"table-3.csv", "table-4.csv", "effect.csv", "pareto.csv"} <= names
     assert "figure-7-and-8-architectures.csv" in names
     assert {Path(n).suffix for n in names if n.startswith("figure-10-confusion-")} == {".csv", ".png", ".svg"}
     for figure in (
         "figure-7-architectures",
         "figure-8-filter-sets",
         "figure-9-size",
-        "acr",
         "effect",
         "pareto-parameters",
     ):
@@ -302,16 +300,6 @@ def test_the_page_is_complete_marked_and_beside_its_files(tmp_path):
     with (made.folder / "table-4.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert all((r["leaky"], r["simulated"], r["split"]) == ("yes", "yes", "windows:holdout") for r in rows)
-
-
-def test_every_figure_says_what_it_is_of(tmp_path):
-    sweep = read_sweep(make_sweep(tmp_path / "S", **SMALL, simulated=True, waiting=0.2))
-    drawn = [d.figure for section in sections_of(sweep) for d in section.drawings]
-    assert len(drawn) >= 8
-    for figure in drawn:
-        said = figure.get_supxlabel().replace("\n", " ")
-        assert "LEAKY" in said and "SIMULATION" in said and "MADE-UP" in said and "one seed, no spread" in said
-        assert f"of {sweep.total} trials done" in said
 
 
 def test_a_fair_split_of_real_data_bears_no_mark(tmp_path):
@@ -388,20 +376,18 @@ def test_a_folder_that_is_no_sweep_is_one_sentence(tmp_path):
         read_sweep(folder)
 
 
-@pytest.mark.parametrize(
-    "dataset", ["short", "a data set with a long name, which somebody gave it who likes long names"]
-)
-def test_nothing_is_cut_off_in_a_small_figure(tmp_path, dataset):
+def test_every_figure_says_what_it_is_of_and_nothing_is_cut_off(tmp_path):
+    dataset = "a data set with a long name, which somebody gave it who likes long names"
     sweep = read_sweep(make_sweep(tmp_path / "S", **ONE, simulated=True, dataset=dataset))
     for section in sections_of(sweep):
         for drawing in section.drawings:
             figure = drawing.figure
             figure.draw_without_rendering()
+            said = figure.get_supxlabel().replace("\n", " ")
+            assert all(part in said for part in ("LEAKY", "SIMULATION", dataset, "one seed, no spread"))
             whole = figure.bbox
             named = [a for axes in figure.axes for a in (axes.title, axes.xaxis.label, axes.yaxis.label)]
-            others = [t for t in figure.texts if t.get_text()]
-            assert others, "what the scores are of"
-            for text in [*others, *(t for t in named if t.get_text())]:
+            for text in (t for t in (*figure.texts, *named) if t.get_text()):
                 box = text.get_window_extent()
                 assert whole.x0 - 1 <= box.x0 and box.x1 <= whole.x1 + 1, (drawing.name, text.get_text())
                 assert whole.y0 - 1 <= box.y0 and box.y1 <= whole.y1 + 1, (drawing.name, text.get_text())
@@ -426,7 +412,6 @@ def test_a_trial_of_some_folds_is_neither_ranked_nor_averaged(tmp_path: Path) ->
         *sweep_tables.best_trials(sweep).rows,
         *sweep_tables.table4(sweep).rows,
         *sweep_tables.architecture_table(sweep).rows,
-        *sweep_tables.acr_ranking(sweep).rows,
         *sweep_tables.pareto(sweep).rows,
         *sweep_tables.effect(sweep).rows,
     ]
@@ -434,3 +419,31 @@ def test_a_trial_of_some_folds_is_neither_ranked_nor_averaged(tmp_path: Path) ->
         assert max(row.get(key) or 0.0 for row in shown) <= 0.8, key
     (network,) = [n for n in sweep.networks if (n.arch, n.filters) == ("250", "8")]
     assert len(network.done) == 3 and network.mean() == pytest.approx(0.3)
+
+
+def test_a_sweeps_folder_makes_its_page(cli: Any, tmp_path: Path) -> None:
+    folder = make_sweep(tmp_path / "S", **ONE_TRIAL)
+    done = cli("report", folder, "--json").json
+    assert (done["trials"], done["done"], done["mlflow"]) == (1, 1, None)
+    assert Path(done["report"]) == folder / "report.html" and Path(done["files"], "table-4.csv").is_file()
+    page = tmp_path / "other.html"
+    ran = cli("report", folder, "--page", page, "--title", "Mine")
+    assert ran.status == 0 and f"{page}: 1 of 1 trial" in ran.out
+    assert "<h1>Mine</h1>" in page.read_text(encoding="utf-8")
+    assert (tmp_path / "other-files" / "table-4.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["{none}"], "not a folder written by sweep, and --dataset is missing"),
+        (["{tmp}/x.html", "--dataset", "{none}", "--mlflow", "{none}"], "--page and --mlflow are for a sweep"),
+        (["{sweep}", "--dataset", "{none}"], "is a sweep"),
+        (["{sweep}", "--page", "{tmp}/x.docx"], "does not end in .html"),
+    ],
+)
+def test_what_does_not_fit_is_refused(cli: Any, tmp_path: Path, words: list[str], said: str) -> None:
+    places = {"none": tmp_path / "none", "tmp": tmp_path, "sweep": make_sweep(tmp_path / "S", **ONE_TRIAL)}
+    ran = cli("report", *(w.format(**places) for w in words))
+    assert ran.status == 2 and said in ran.err and ran.out == ""
+    assert not (tmp_path / "x.html").exists()

@@ -18,7 +18,6 @@ from pathlib import Path, PurePosixPath
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.sentences import Sentence
-from plushsense.dataset.importing.build import DEVICE_NAME
 
 _CHUNK = 1 << 20
 # The earliest time that a zip can store.
@@ -28,6 +27,8 @@ _LONGEST_NAME = 200
 _LONGEST_PATH = 800
 # Small files are exempt from the ratio, since a recording of zeros compresses well.
 _SMALL_BYTES = 4_000_000
+# Names that Windows reserves for devices, with any suffix.
+DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$)\s*(\.|$)", re.IGNORECASE)
 _FORBIDDEN = re.compile(r'[\x00-\x1f\x7f:*?"<>|]')
 DAMAGED: tuple[type[Exception], ...] = (
     zipfile.BadZipFile,

@@ -1,25 +1,57 @@
-"""Create a data set from the files of a source: copy them, read the copies, and report the result for each file."""
+"""Create a data set from a scanned source, or add to one: copy the files, read the copies, account for every file.
+
+Raw files are copied unchanged. Existing files, marks and class numbers stay as they are.
+"""
 
 from __future__ import annotations
 
 import hashlib
-import re
+import os
+import shutil
+import tempfile
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+
+from filelock import Timeout
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.files import new_folder
+from plushsense.core.files import new_folder, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence, plural
-from plushsense.dataset.files import sha256_of
-from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
+from plushsense.core.sentences import Sentence, join_names, plural
+from plushsense.dataset.files import CACHE, sha256_of, walk_files
+from plushsense.dataset.importing.results import (
+    NO_PEOPLE,
+    NO_PEOPLE_OF_WINDOWS,
+    SIMULATED,
+    FileReason,
+    ImportResult,
+    group_flags,
+)
+from plushsense.dataset.importing.sources import (
+    COMPANIONS,
+    LEFT_OUT,
+    PATTERN,
+    WINDOWS,
+    SourceFile,
+    SourceScan,
+    folder_name,
+)
 from plushsense.dataset.importing.truncation import IMPORTER, truncation_marks
-from plushsense.dataset.index import DUPLICATE_FOLDER, IndexBuild, apply_marks, build_index, write_index_files
-from plushsense.dataset.marks import Mark, MarkState, append_marks, read_marks
+from plushsense.dataset.index import (
+    DUPLICATE_FOLDER,
+    IndexBuild,
+    apply_marks,
+    build_index,
+    open_dataset,
+    rebuild_index,
+    write_index_files,
+)
+from plushsense.dataset.marks import Mark, MarkState, adding_locked, append_marks, read_marks, write_marks
+from plushsense.dataset.privacy.forget import read_removals
 from plushsense.dataset.store import (
     HEAD,
     RECORDINGS,
@@ -27,25 +59,20 @@ from plushsense.dataset.store import (
     UNKNOWN_SUBJECT,
     Dataset,
     DatasetHead,
+    Generation,
     PersonInfo,
     Progress,
     RecordingInfo,
+    read_people,
     write_people,
 )
 from plushsense.recording.session_files import SESSION_LOG
 
+RECORDER = "recorder"
 TWICE = Sentence("the same file was already imported", reason="file_twice")
 # Files to which the recorder only appends.
 APPENDED = (STREAM_NAME, SESSION_LOG)
 _LONGEST = 120
-# Names that Windows reserves for devices, with any suffix.
-DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$)\s*(\.|$)", re.IGNORECASE)
-
-
-def folder_name(code: str, otherwise: str = UNKNOWN_SUBJECT) -> str:
-    """Return a folder name for ``code`` that is valid on any system and inside the data set."""
-    name = "".join(c if c.isalnum() or c in "-_. " else "_" for c in code).strip(" .")
-    return f"{name}_" if DEVICE_NAME.match(name) else name or otherwise
 
 
 def session_folder(session: str) -> str:
@@ -85,43 +112,66 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
             )
 
 
-def _orphan(name: str) -> Sentence:
-    """Return the reason to refuse a companion of the file ``name``, which was not imported."""
-    return Sentence(f"belongs to '{name}', which was not imported", reason="file_orphan")
+class ImportedFiles:
+    """Files of a scan, copied into the folder ``work``, which becomes a data set or part of one, and their status.
 
-
-@dataclass
-class Copier:
-    """Copier of files into ``work``, which becomes a data set or part of one.
-
-    ``taken`` maps the files of the data set, by `key_of`, to SHA-256. ``contents`` maps kind and SHA-256 of existing
-    raw files, which are not copied again, to their paths. ``there`` is the folder of the existing data set, in which a
-    stream or log is replaced if the source has a longer version of it.
+    Attributes:
+        kept: the copied files by their new path below the data set.
+        already: path below the data set of each source that exists already.
+        grown: paths of existing streams and logs of which the source has a longer version, which replaces them.
+        rejected: files that cannot be used.
+        left_out: files that are not needed.
     """
 
-    work: Path
-    taken: dict[str, str] = field(default_factory=dict)
-    contents: dict[tuple[str, str], str] = field(default_factory=dict)
-    there: Path | None = None
-    grown: set[str] = field(default_factory=set)
-    """Paths below the data set of existing files that are replaced by longer ones."""
-    copied: dict[Path, str] = field(default_factory=dict)
-    """New path below the data set of each source that was copied."""
-    already: dict[Path, str] = field(default_factory=dict)
-    """Path below the data set of each source that exists already."""
-    companions: dict[str, list[Path]] = field(default_factory=dict)
-    """Sources of the companions of each copied file, by its new path."""
+    def __init__(self, scan: SourceScan, work: Path, existing: Dataset | None = None):
+        self.scan, self.work = scan, work
+        self.kept: dict[str, SourceFile] = {}
+        self.already: dict[Path, str] = {}
+        self.grown: set[str] = set()
+        self.rejected: list[FileReason] = []
+        self.left_out: list[FileReason] = []
+        self._there = existing.path if existing is not None else None
+        self._copied: dict[Path, str] = {}
+        # SHA-256 of each file of the data set, by `_key_of`; and paths of existing raw files by kind and SHA-256.
+        self._taken: dict[str, str] = {}
+        self._contents: dict[tuple[str, str], str] = {}
+        if existing is not None:
+            self._take(existing)
+        # Raw files lie in recordings/<person>/ and streams/<person>/.
+        people = {Path(file).parts[1] for file in self._contents.values() if len(Path(file).parts) > 2}
+        refuse_merged([f for f in scan.found if f.kind in (RECORDINGS, STREAMS)], people)
+        # Companions come last, since they are copied beside their files.
+        for found in sorted(scan.found, key=lambda f: f.kind == COMPANIONS):
+            if found.kind == LEFT_OUT:
+                self.left_out.append(FileReason(found.origin, found.reason))
+            elif not found.kind:
+                self.reject(found, found.reason)
+            elif reason := self._copy(found):
+                self.reject(found, reason)
 
-    def copy(self, file: SourceFile) -> str:
+    def _take(self, existing: Dataset) -> None:
+        """Note the files of the existing data set, which are not copied again."""
+        for kind, infos in ((RECORDINGS, existing.recordings), (STREAMS, existing.streams)):
+            for info in infos:
+                # Recordings that are parts of a stream have no file of their own.
+                if info.file.startswith(f"{kind}/"):
+                    self._taken[_key_of(info.file, companion=False)] = info.sha256
+                    self._contents[(kind, info.sha256)] = info.file
+        for path in (*walk_files(existing.path / RECORDINGS), *walk_files(existing.path / STREAMS)):
+            if path.suffix.lower() != ".csv":
+                key = _key_of(path.relative_to(existing.path).as_posix(), companion=True)
+                self._taken[key] = sha256_of(path)
+
+    def _copy(self, file: SourceFile) -> str:
         """Copy a file and return "", or the reason why not; companions must come after the file they belong to."""
         try:
             raw = file.source.read_bytes()
         except OSError as cause:
             return Sentence(f"cannot be read: {cause.strerror or cause}", reason="file_unreadable")
         content = hashlib.sha256(raw).hexdigest()
-        existing = self.contents.get((file.kind, content))
-        if existing is None and self.contents and file.cut is not None:
-            existing = self.contents.get((file.kind, sha256_of(file.cut)))
+        existing = self._contents.get((file.kind, content))
+        if existing is None and self._contents and file.cut is not None:
+            existing = self._contents.get((file.kind, sha256_of(file.cut)))
         if existing is not None:
             self.already[file.source] = existing
             return ""
@@ -131,27 +181,25 @@ class Copier:
         companion = file.kind == COMPANIONS
         name = file.source.name
         place, again = folder, 1
-        while (key := key_of(f"{place}/{name}", companion=companion)) in self.taken:
-            if self.taken[key] == content:
-                if companion or self.contents:
-                    self.already[file.source] = f"{place}/{name}"
-                    return ""
+        while (key := _key_of(f"{place}/{name}", companion=companion)) in self._taken:
+            target = f"{place}/{name}"
+            if self._taken[key] == content and not (companion or self._contents):
                 return TWICE
-            if (longer := self._continues(f"{place}/{name}", raw)) is False:
-                self.already[file.source] = f"{place}/{name}"
+            longer = None if self._taken[key] == content else self._continues(target, raw)
+            if longer is False or self._taken[key] == content:
+                self.already[file.source] = target
                 return ""
             if longer:
-                self.grown.add(f"{place}/{name}")
+                self.grown.add(target)
                 break
             again += 1
             place = f"{folder}/{DUPLICATE_FOLDER}{again}"
-        self.taken[key] = content
-        target = self.work / place / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(raw)
-        self.copied[file.source] = f"{place}/{name}"
-        if companion and file.beside is not None:
-            self.companions.setdefault(self.copied.get(file.beside, ""), []).append(file.source)
+        self._taken[key] = content
+        path = self.work / place / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(raw)
+        self._copied[file.source] = f"{place}/{name}"
+        self.kept[f"{place}/{name}"] = file
         return ""
 
     def _continues(self, file: str, raw: bytes) -> bool | None:
@@ -159,10 +207,10 @@ class Copier:
 
         An incomplete last line is ignored, since the recorder completes it.
         """
-        if self.there is None or file.rpartition("/")[2] not in APPENDED or file in self.grown:
+        if self._there is None or file.rpartition("/")[2] not in APPENDED or file in self.grown:
             return None
         try:
-            old = (self.there / file).read_bytes()
+            old = (self._there / file).read_bytes()
         except OSError:
             return None
         shorter, longer = sorted((old, raw), key=len)
@@ -172,133 +220,39 @@ class Copier:
     def _folder(self, file: SourceFile) -> str | None:
         """Return the destination folder of a file; None for a companion whose file was not copied."""
         if file.beside is not None:
-            main = self.copied.get(file.beside) or self.already.get(file.beside)
+            main = self._copied.get(file.beside) or self.already.get(file.beside)
             return None if main is None else main.rpartition("/")[0]
         folder = f"{STREAMS if file.kind == COMPANIONS else file.kind}/{folder_name(file.subject)}"
         return f"{folder}/{session_folder(file.session)}" if file.session else folder
 
-
-def key_of(path: str, *, companion: bool) -> str:
-    """Return the key of a path in `Copier.taken`: case-folded, for raw files without suffix, as their ids."""
-    folder, _, name = path.casefold().rpartition("/")
-    return f"{folder}/{name}/" if companion else f"{folder}/{name.rpartition('.')[0]}"
-
-
-RECORDER = "recorder"
-SIMULATED = Sentence(
-    "these recordings are a simulation: scores on them say nothing about a real toy", reason="simulated"
-)
-NO_PEOPLE = Sentence(
-    "the folders are gestures, so the people are not known: splits by subject are not possible; "
-    "import again with --streams DIR if the fulldatastream.csv of each person is there, or with --subjects map.csv "
-    "(columns file,subject) if a mapping is",
-    reason="people_unknown",
-)
-
-
-PATTERN = "pattern"
-WINDOWS = "windows"
-NO_PEOPLE_OF_WINDOWS = (
-    "the windows do not name the people, so splits by subject are not possible: import the recordings, if they exist"
-)
-
-
-@dataclass
-class ImportSummary:
-    """Result of an import; ``rejected`` and ``left_out`` have an entry for each file, ``warnings`` for each kind.
-
-    ``recordings``, ``subjects``, ``gestures`` and ``streams`` describe the data set after the import; ``added`` counts
-    new recordings and streams, ``already_there`` the files that existed already, ``companions`` the copied sidecars,
-    session heads and logs, ``excluded`` the new recordings that are excluded, ``trimmed`` the trims by the choices of
-    the authors' truncation script. Each recording's own warnings are its flags in the index.
-    """
-
-    dataset: Dataset
-    recordings: int
-    subjects: int
-    gestures: list[str]
-    streams: int
-    rejected: list[dict[str, str]]
-    warnings: list[str]
-    seconds: float
-    notes: list[str] = field(default_factory=list)
-    left_out: list[dict[str, str]] = field(default_factory=list)
-    companions: int = 0
-    excluded: int = 0
-    added: dict[str, int] = field(default_factory=dict)
-    already_there: int = 0
-    proposals: list[dict[str, Any]] = field(default_factory=list)
-    sensors: list[dict[str, Any]] = field(default_factory=list)
-    trimmed: int = 0
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        hidden = ("dataset", "notes", "warnings", "seconds")
-        return {key: value for key, value in vars(self).items() if key not in hidden} | {
-            "warnings": self.notes + self.warnings,
-            "seconds": round(self.seconds, 2),
-            "hash": self.dataset.hash,
-        }
-
-
-class ImportedFiles:
-    """Files of a search, copied into the work folder of ``copier``, with the result for each."""
-
-    def __init__(self, search: SourceScan, copier: Copier):
-        self.search = search
-        self.copier = copier
-        self.rejected: list[dict[str, str]] = []
-        self.left_out: list[dict[str, str]] = []
-        self._origin: dict[str, SourceFile] = {}
-        # Raw files lie in recordings/<person>/ and streams/<person>/.
-        people = {Path(file).parts[1] for file in copier.contents.values() if len(Path(file).parts) > 2}
-        refuse_merged([f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people)
-        # Companions come last, since they are copied beside their files.
-        for found in sorted(search.found, key=lambda f: f.kind == COMPANIONS):
-            if found.kind == LEFT_OUT:
-                self.left_out.append({"file": found.origin, "reason": found.reason})
-            elif not found.kind:
-                self.reject(found, found.reason)
-            elif reason := copier.copy(found):
-                self.reject(found, reason)
-            elif found.source in copier.copied:
-                self._origin[copier.copied[found.source]] = found
-
     def reject(self, file: SourceFile, reason: str) -> None:
-        self.rejected.append({"file": file.origin, "reason": reason})
+        self.rejected.append(FileReason(file.origin, reason))
 
-    def drop(self, unreadable: Mapping[str, str]) -> None:
-        """Remove unreadable files and their companions from the work folder, and reject them."""
-        for file, reason in unreadable.items():
-            self.reject(self._origin[file], reason)
-            self._remove(file)
-            for source in self.copier.companions.pop(file, ()):
-                if (companion := self.copier.copied.get(source)) is not None:
-                    self.reject(self._origin[companion], _orphan(Path(file).name))
-                    self._remove(companion)
+    def read(self, head: DatasetHead, progress: Progress | None) -> IndexBuild:
+        """Build the index of the copied files; remove those that cannot be read, with their companions."""
+        built = build_index(self.work, head, progress)
+        for file, reason in built.unreadable.items():
+            main = self.kept[file]
+            self._drop(file, reason)
+            for companion in [f for f, found in self.kept.items() if found.beside == main.source]:
+                self._drop(companion, _orphan(Path(file).name))
+        return built
 
-    def _remove(self, file: str) -> None:
-        (self.copier.work / file).unlink()
-        del self.copier.copied[self._origin.pop(file).source]
-
-    @property
-    def kept(self) -> dict[str, SourceFile]:
-        """Copied files by their path below the data set."""
-        return dict(self._origin)
+    def _drop(self, file: str, reason: str) -> None:
+        found = self.kept.pop(file)
+        self.reject(found, reason)
+        (self.work / file).unlink()
+        del self._copied[found.source]
 
     @property
-    def sources(self) -> dict[str, Path]:
-        """Sources of copied files, and of those that existed already, by their path below the data set."""
-        return {file: path for path, file in (self.copier.already | self.copier.copied).items()}
-
-    def count(self, kind: str) -> int:
-        """Count the copied files of a kind."""
-        return sum(f.kind == kind for f in self._origin.values())
+    def places(self) -> dict[Path, str]:
+        """Path below the data set of each source that was copied or existed already."""
+        return self.already | self._copied
 
     def check(self) -> None:
-        """Assert that every file of the search was copied, exists already, or is rejected or left out."""
-        accounted = len(self._origin) + len(self.copier.already) + len(self.rejected) + len(self.left_out)
-        assert accounted == len(self.search.found), "every source file is imported, left out or rejected"
+        """Assert that every file of the scan was copied, exists already, or is rejected or left out."""
+        accounted = len(self.kept) + len(self.already) + len(self.rejected) + len(self.left_out)
+        assert accounted == len(self.scan.found), "every source file is imported, left out or rejected"
 
     def marks(
         self, recordings: Iterable[RecordingInfo], gestures: GestureSet, states: Mapping[str, MarkState] | None = None
@@ -310,11 +264,12 @@ class ImportedFiles:
             gestures: the gesture set of the data set.
         """
         recordings = list(recordings)
-        trims, notes = truncation_marks(self.search.choices, recordings, self.sources, states)
-        folders = {f.source: f.gesture for f in self.search.found}
+        sources = {file: path for path, file in self.places.items()}
+        trims, notes = truncation_marks(self.scan.choices, recordings, sources, states)
+        folders = {f.source: f.gesture for f in self.scan.found}
         labels = []
         for info in recordings:
-            source = self.sources.get(info.file)
+            source = sources.get(info.file)
             now = (states or {}).get(info.id, MarkState())
             if source is None or source not in folders or now.gesture_by not in ("", IMPORTER):
                 continue
@@ -329,16 +284,48 @@ class ImportedFiles:
                 labels.append(Mark(info.id, "relabel", IMPORTER, why))
         return trims, labels, notes
 
-    def set_aside_reasons(self) -> dict[str, str]:
+    def discarded(self) -> dict[str, str]:
         """Return for each recording id, also of existing files, why the recorder discarded it ("" if it did not)."""
-        places = self.copier.copied | self.copier.already
-        mine = (f for f in self.search.found if f.kind == RECORDINGS and f.source in places)
-        return {recording_id(places[f.source]): f.set_aside for f in mine}
+        places = self.places
+        mine = (f for f in self.scan.found if f.kind == RECORDINGS and f.source in places)
+        return {places[f.source].removeprefix(f"{RECORDINGS}/").rpartition(".")[0]: f.set_aside for f in mine}
+
+    def result(self, dataset: Dataset, notes: Sequence[str], trims: int) -> ImportResult:
+        """Return the result of the import, of which ``dataset`` is the data set."""
+        # A scan by a pattern, or in streams, has a note on people already.
+        noted = self.scan.shape == PATTERN or self.scan.streams_named
+        unknown = not noted and any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
+        new = [r for r in dataset.recordings if r.file in self.kept]
+        flagged = [s for s in dataset.streams if s.file in self.kept] + new
+        kinds = Counter(f.kind for f in self.kept.values())
+        return ImportResult(
+            dataset,
+            tuple(self.rejected),
+            tuple(self.left_out),
+            tuple(group_flags((info.id, flag) for info in flagged for flag in info.flags)),
+            (
+                *([SIMULATED] if dataset.head.simulated else ()),
+                *notes,
+                *([_no_people(dataset, self.scan.shape)] if unknown else ()),
+            ),
+            companions=kinds[COMPANIONS],
+            excluded=sum(r.excluded for r in new),
+            added_recordings=len(new),
+            added_streams=kinds[STREAMS],
+            already_there=len(self.already),
+            trimmed=trims,
+        )
 
 
-def recording_id(file: str) -> str:
-    """Return the id of a recording from its path below the data set."""
-    return file.removeprefix(f"{RECORDINGS}/").rpartition(".")[0]
+def _orphan(name: str) -> Sentence:
+    """Return the reason to refuse a companion of the file ``name``, which was not imported."""
+    return Sentence(f"belongs to '{name}', which was not imported", reason="file_orphan")
+
+
+def _key_of(path: str, *, companion: bool) -> str:
+    """Return a path as it is compared with others: case-folded, that of a raw file without suffix, as its id."""
+    folder, _, name = path.casefold().rpartition("/")
+    return f"{folder}/{name}/" if companion else f"{folder}/{name.rpartition('.')[0]}"
 
 
 def unknown_labels(given: GestureSet, labels: Iterable[str]) -> str:
@@ -356,7 +343,7 @@ def unknown_labels(given: GestureSet, labels: Iterable[str]) -> str:
     )
 
 
-def extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
+def _extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
     """Return ``given`` with the labels that it lacks, or infer a set from the recordings if it is None."""
     if given is None:
         return GestureSet.infer(r.gesture for r in dataset.recordings)
@@ -366,7 +353,7 @@ def extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
     return GestureSet(given.name, given.gestures + GestureSet.infer(unknown).gestures, given.inferred)
 
 
-def merge_people(
+def _merge_people(
     there: Mapping[str, PersonInfo], sessions: Iterable[PersonInfo], file: Mapping[str, PersonInfo], subjects: set[str]
 ) -> tuple[list[PersonInfo], list[str]]:
     """Merge the people ``there`` with ``sessions``, which fill gaps, and the user's ``file``, which overrides both."""
@@ -401,81 +388,6 @@ def merge_people(
     return list(people.values()), notes
 
 
-def create_dataset(
-    source: Path,
-    dest: Path,
-    search: SourceScan,
-    head: DatasetHead,
-    people: Mapping[str, PersonInfo],
-    progress: Progress | None,
-) -> ImportSummary:
-    """Create the data set ``dest`` from a search, completely or not at all.
-
-    Raises:
-        DatasetError: if no recording can be read, or ``dest`` is not empty.
-    """
-    with new_folder(dest, DatasetError, last=HEAD) as work:
-        account = ImportedFiles(search, Copier(work))
-        if search.gestures is None:
-            names = (parse_name(Path(file).name) for file in account.kept)
-            head = replace(head, gestures=GestureSet.infer(n.label for n in names if n is not None))
-        built = read_copied(account, head, progress)
-        if not built.dataset.recordings:
-            # What is wrong with the recordings, rather than with a stream.
-            unreadable = sorted(built.unreadable.items(), key=lambda entry: not entry[0].startswith(f"{RECORDINGS}/"))
-            reasons = [
-                *(reason for _, reason in unreadable),
-                *(r["reason"] for r in account.rejected),
-                *search.notes[-1:],
-            ]
-            if not reasons:
-                message = f"'{source}' holds no finished recording yet, only a stream: record some first."
-                raise DatasetError(message, reason="import_only_stream")
-            raise DatasetError(
-                f"'{source}' holds no recording that layout '{head.layout.name}' can read. The first: {reasons[0]}",
-                reason="import_unreadable",
-                layout=head.layout.name,
-                first=reasons[0],
-            )
-        virtual = [] if head.simulated or not built.virtual else [virtual_note(built)]
-        head = replace(
-            head,
-            gestures=extend_gestures(search.gestures, built.dataset),
-            simulated=head.simulated or built.virtual > 0,
-        )
-        if {r.gesture for r in built.dataset.recordings} - set(head.gestures.labels):
-            # The set merges spellings of labels: build the index again with the complete set.
-            built = build_index(work, head)
-        listed, notes = merge_people({}, search.people, people, {r.subject for r in built.dataset.recordings})
-        if listed:
-            write_people(work, listed)
-        trims, labels, remarks = account.marks(built.dataset.recordings, head.gestures)
-        marks = [Mark(i, "exclude", RECORDER, why) for i, why in account.set_aside_reasons().items() if why]
-        append_marks(work, marks + trims + labels)
-        (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
-        infos = apply_marks(built.dataset.recordings, read_marks(work), head.gestures)
-        write_index_files(Dataset(work, head, infos, built.dataset.streams))
-        account.check()
-    dataset = Dataset(dest, head, infos, built.dataset.streams)
-    if search.gestures is not None and (note := unknown_labels(search.gestures, (r.gesture for r in infos))):
-        notes.append(note)
-    return summarize_import(dataset, account, virtual + search.notes + notes + remarks, set(account.kept), len(trims))
-
-
-def virtual_note(built: IndexBuild) -> Sentence:
-    """Return the note that the times of recordings tell that they are simulated."""
-    of = len(built.dataset.recordings)
-    message = f"{built.virtual} of {plural(of, 'recording')} are of a virtual toy, as the times of their rows tell"
-    return Sentence(message, reason="virtual_recordings", n=built.virtual, of=of)
-
-
-def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | None) -> IndexBuild:
-    """Build the index of the copied files, and remove those that cannot be read."""
-    built = build_index(account.copier.work, head, progress)
-    account.drop(built.unreadable)
-    return built
-
-
 def _no_people(dataset: Dataset, shape: str) -> str:
     """Return the note that the people of some recordings, or of all, are not known."""
     if shape == WINDOWS:
@@ -493,53 +405,200 @@ def _no_people(dataset: Dataset, shape: str) -> str:
     )
 
 
-def summarize_import(
-    dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str], trims: int = 0
-) -> ImportSummary:
-    """Return the summary of an import that added the files ``new``, and ``trims`` of recordings."""
-    # A search by a pattern, or in streams, has said so.
-    said = account.search.shape == PATTERN or account.search.streams_named
-    unknown = not said and any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
-    mine = [r for r in dataset.recordings if r.file in new]
-    flagged = [s for s in dataset.streams if s.file in new] + mine
-    return ImportSummary(
-        dataset,
-        len(dataset.recordings),
-        len(dataset.subjects),
-        sorted({r.gesture for r in dataset.recordings}),
-        len(dataset.streams),
-        account.rejected,
-        group_flags((info.id, flag) for info in flagged for flag in info.flags),
-        0.0,
-        [
-            *([SIMULATED] if dataset.head.simulated else ()),
-            *notes,
-            *([_no_people(dataset, account.search.shape)] if unknown else ()),
-        ],
-        left_out=account.left_out,
-        companions=account.count(COMPANIONS),
-        excluded=sum(r.excluded for r in mine),
-        added={"recordings": len(mine), "streams": account.count(STREAMS)},
-        already_there=len(account.copier.already),
-        trimmed=trims,
+def create_dataset(
+    source: Path,
+    dest: Path,
+    scan: SourceScan,
+    head: DatasetHead,
+    people: Mapping[str, PersonInfo],
+    progress: Progress | None,
+) -> ImportResult:
+    """Create the data set ``dest`` from a scan, completely or not at all.
+
+    Raises:
+        DatasetError: if no recording can be read, or ``dest`` is not empty.
+    """
+    with new_folder(dest, DatasetError, last=HEAD) as work:
+        files = ImportedFiles(scan, work)
+        if scan.gestures is None:
+            names = (parse_name(Path(file).name) for file in files.kept)
+            head = replace(head, gestures=GestureSet.infer(n.label for n in names if n is not None))
+        built = files.read(head, progress)
+        if not built.dataset.recordings:
+            raise _nothing_read(source, files, built, head)
+        virtual = [] if head.simulated or not built.virtual else [_virtual_note(built)]
+        gestures = _extend_gestures(scan.gestures, built.dataset)
+        head = replace(head, gestures=gestures, simulated=head.simulated or built.virtual > 0)
+        if {r.gesture for r in built.dataset.recordings} - set(gestures.labels):
+            # The set merges spellings of labels: build the index again with the complete set.
+            built = build_index(work, head)
+        listed, notes = _merge_people({}, scan.people, people, {r.subject for r in built.dataset.recordings})
+        if listed:
+            write_people(work, listed)
+        trims, labels, remarks = files.marks(built.dataset.recordings, gestures)
+        marks = [Mark(i, "exclude", RECORDER, why) for i, why in files.discarded().items() if why]
+        append_marks(work, marks + trims + labels)
+        (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
+        infos = apply_marks(built.dataset.recordings, read_marks(work), gestures)
+        write_index_files(Dataset(work, head, infos, built.dataset.streams))
+        files.check()
+    if scan.gestures is not None and (note := unknown_labels(scan.gestures, (r.gesture for r in infos))):
+        notes.append(note)
+    dataset = Dataset(dest, head, infos, built.dataset.streams)
+    return files.result(dataset, virtual + scan.notes + notes + remarks, len(trims))
+
+
+def _nothing_read(source: Path, files: ImportedFiles, built: IndexBuild, head: DatasetHead) -> DatasetError:
+    """Return the error that no recording of a source can be read."""
+    # What is wrong with the recordings, rather than with a stream.
+    unreadable = sorted(built.unreadable.items(), key=lambda entry: not entry[0].startswith(f"{RECORDINGS}/"))
+    reasons = [
+        *(reason for _, reason in unreadable),
+        *(entry.reason for entry in files.rejected),
+        *files.scan.notes[-1:],
+    ]
+    if not reasons:
+        message = f"'{source}' holds no finished recording yet, only a stream: record some first."
+        return DatasetError(message, reason="import_only_stream")
+    return DatasetError(
+        f"'{source}' holds no recording that layout '{head.layout.name}' can read. The first: {reasons[0]}",
+        reason="import_unreadable",
+        layout=head.layout.name,
+        first=reasons[0],
     )
 
 
-_PARTS = re.compile(r"\([^()]*\)|'[^']*'|(?<= as ).+|[+-]?\d+(?:\.\d+)?( \w+?)?s?\b")
+def _virtual_note(built: IndexBuild) -> Sentence:
+    """Return the note that the times of recordings tell that they are simulated."""
+    of = len(built.dataset.recordings)
+    message = f"{built.virtual} of {plural(of, 'recording')} are of a virtual toy, as the times of their rows tell"
+    return Sentence(message, reason="virtual_recordings", n=built.virtual, of=of)
 
 
-def group_flags(flags: Iterable[tuple[str, str]], noun: str = "recordings or streams") -> list[str]:
-    """Return one warning for each kind of flag.
+@contextmanager
+def _locked_work_folder(dest: Path) -> Iterator[Path]:
+    """Create a work folder on the disk of the data set for one import at a time; remove those of killed imports."""
+    cache = dest / CACHE
+    try:
+        with adding_locked(dest):
+            cache.mkdir(exist_ok=True)
+            for left in cache.glob("adding-*"):
+                shutil.rmtree(left, ignore_errors=True)
+            work = Path(tempfile.mkdtemp(prefix="adding-", dir=cache))
+            try:
+                yield work
+            finally:
+                shutil.rmtree(work, ignore_errors=True)
+    except Timeout:
+        message = f"Another import is adding to '{dest}' now: wait until it ends."
+        raise DatasetError(message, reason="import_runs") from None
+
+
+def _new_marks(states: Mapping[str, MarkState], discarded: Mapping[str, str]) -> list[Mark]:
+    """Return marks for recordings that the recorder has discarded or kept since; marks of people take precedence.
 
     Args:
-        flags: the id of a recording or stream, and the message of a check. Messages are of one kind if they differ
-            only in numbers, names in quotes or at the end behind "as", and remarks in brackets.
-        noun: what the ids are of.
+        discarded: by recording id, the reason why the recorder discarded it, "" if it did not.
     """
-    kinds: dict[str, list[tuple[str, str]]] = {}
-    for identity, flag in flags:
-        kinds.setdefault(_PARTS.sub(lambda part: f"#{part[1] or ''}", flag), []).append((identity, flag))
+    marks = []
+    for recording, why in discarded.items():
+        now = states.get(recording, MarkState())
+        if now.excluded_by in ("", RECORDER) and now.excluded != bool(why):
+            marks.append(Mark(recording, "exclude" if why else "include", RECORDER, why or "kept after all"))
+    return marks
+
+
+def add_to_dataset(
+    dest: Path,
+    scan: SourceScan,
+    gestures: GestureSet | None,
+    people: Mapping[str, PersonInfo],
+    progress: Progress | None,
+    generation: Generation,
+) -> ImportResult:
+    """Add the files of a scan to the data set ``dest``; ``gestures`` may describe gestures that it lacks.
+
+    ``generation`` is that of ``dest`` before the source was read.
+
+    Raises:
+        ForgottenError: if a person, who may be among the new files, was removed since.
+        DatasetError: if the data set cannot be opened, nothing can be added, or another import is running.
+    """
+    with _locked_work_folder(dest) as work:
+        dataset = open_dataset(dest)
+        files = ImportedFiles(scan, work, dataset)
+        own = dataset.head.gestures
+        if new_gestures := tuple(g for g in (gestures.gestures if gestures else ()) if own.find(g.label) is None):
+            own = GestureSet(own.name, own.gestures + new_gestures)
+        head = replace(dataset.head, gestures=own)
+        built = files.read(head, progress)
+        _refuse_unfit(dest, dataset, files, built)
+        head = replace(head, gestures=_extend_gestures(own, built.dataset))
+        both = (*dataset.recordings, *built.dataset.recordings)
+        there = read_people(dest)
+        listed, notes = _merge_people(there, scan.people, people, {r.subject for r in both})
+        files.check()
+        # Without the lock, marks and the people's table could restore a person who is removed meanwhile.
+        with generation.writing():
+            if head.gestures != dataset.head.gestures:
+                write_file(dest / HEAD, head.to_toml())
+            states = read_marks(dest)
+            trims, labels, remarks = files.marks(both, head.gestures, states)
+            marks = [*_new_marks(states, files.discarded()), *trims, *labels]
+            write_marks(dest, marks)
+            if {p.subject: p for p in listed} != there:
+                write_people(dest, listed)
+            _move_files(files, dest)
+        rebuilt = rebuild_index(dest, head).dataset if files.kept or marks else open_dataset(dest)
+    come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
+    notes += remarks + _returning_people_warning(dest, come)
+    if note := unknown_labels(own, (r.gesture for r in built.dataset.recordings)):
+        notes.append(note)
+    return files.result(rebuilt, scan.notes + notes, len(trims))
+
+
+def _refuse_unfit(dest: Path, dataset: Dataset, files: ImportedFiles, built: IndexBuild) -> None:
+    """Raise DatasetError if real recordings would be mixed with simulated ones, or no file can be read."""
+    simulated = files.scan.simulated or built.virtual > 0
+    if dataset.head.simulated != simulated and (simulated or files.kept):
+        kinds = ("real", "virtual") if simulated else ("virtual", "real")
+        raise DatasetError(
+            f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them apart.",
+            reason="real_and_virtual",
+        )
+    if files.rejected and not files.kept and not files.already:
+        first, layout = files.rejected[0], dataset.layout.name
+        raise DatasetError(
+            f"Nothing of the source fits '{dest}', whose layout is '{layout}': rejected are all files "
+            f"({len(files.rejected)}). The first: '{first.file}': {first.reason.rstrip('.')}.",
+            reason="import_unreadable",
+            layout=layout,
+            first=first.reason,
+        )
+
+
+def _move_files(files: ImportedFiles, dest: Path) -> None:
+    """Move the copied files into the data set; companions first, so that a recording there always has its sidecar."""
+    for file in sorted(files.kept, key=lambda f: (f.lower().endswith(".csv"), f)):
+        target = dest / file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if target.exists() and file not in files.grown:
+            raise DatasetError(f"'{target}' appeared during the import and is not overwritten: import again.")
+        os.replace(files.work / file, target)
+
+
+def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
+    """Return a warning if ``come`` were added to a data set from which people were removed: they may be the same."""
+    gone = read_removals(dest)
+    if not come or not gone:
+        return []
+    days = ", ".join(dict.fromkeys(g.day for g in gone))
+    listed = join_names(come, most=5)
     return [
-        (f"{len(found)} {noun}, for instance " if len(found) > 1 else "") + ": ".join(found[0])
-        for found in kinds.values()
+        Sentence(
+            f"people were removed from this data set ({len(gone)}; {days}), and {listed} were added now: remove a "
+            f"person again with  plushsense forget {dest} CODE",
+            reason="removed_return",
+            people=", ".join(come),
+        )
     ]

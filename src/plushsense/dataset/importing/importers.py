@@ -1,377 +1,102 @@
 """Import recordings into a new or existing data set; raw files are copied unchanged.
 
-To support another file format, add a function that scans a file to ``FORMATS``; another folder structure is a function
-in `importing.sources`.
+An import scans the source (`importing.scanning`), makes or extends the data set (`importing.build`), and measures what
+would fit the recordings better (`importing.proposals`).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, Unpack
 
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
 from plushsense.core.files import temporary_folder, work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
-from plushsense.core.layouts import DEVICE_MS, Layout, layout_names, load_layout
-from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
-from plushsense.core.sentences import Sentence, plural
-from plushsense.dataset.importing.adding import add_to_dataset
-from plushsense.dataset.importing.archives import UnpackLimits, unpack
-from plushsense.dataset.importing.build import (
-    PATTERN,
-    WINDOWS,
-    ImportSummary,
-    create_dataset,
-    folder_name,
-    group_flags,
-)
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.recorder_csv import Frames, parse_name, read_recording, read_stream
+from plushsense.core.sentences import Sentence
+from plushsense.dataset.importing.archives import UnpackLimits
+from plushsense.dataset.importing.build import add_to_dataset, create_dataset, unknown_labels
 from plushsense.dataset.importing.counters import counters_note
-from plushsense.dataset.importing.intervals import read_intervals
-from plushsense.dataset.importing.pattern import ImportPattern, check_roles, read_pattern
-from plushsense.dataset.importing.preview import ImportPreview, preview
-from plushsense.dataset.importing.proposals import (
-    SELF_CALIBRATION,
-    adopt,
-    find_sensors,
-    matching_layouts,
-    propose_settings,
-    readable_layouts,
-    recorded_layouts,
-)
-from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
-from plushsense.dataset.importing.sources import (
-    LEFT_OUT,
-    SourceFile,
-    SourceScan,
-    classify_files,
-    classify_session_files,
-    common_layout,
-    is_simulation,
-    moved_note,
-    people_of,
-    printable_path,
-    read_mapping,
-    read_sessions,
-    session_of,
-    source_files,
-    split_regular_files,
-)
-from plushsense.dataset.importing.streams import find_people
-from plushsense.dataset.importing.tables import TableImport
-from plushsense.dataset.importing.truncation import CHOSEN, REPLACED, Backups, choices_of
-from plushsense.dataset.importing.xdf import ENDINGS, is_xdf, person_and_session, read_xdf
+from plushsense.dataset.importing.pattern import ImportPattern, read_pattern
+from plushsense.dataset.importing.proposals import SELF_CALIBRATION, Proposal, adopt, find_sensors, propose_settings
+from plushsense.dataset.importing.results import FileReason, ImportPreview, ImportResult, PreviewRow, group_flags
+from plushsense.dataset.importing.scanning import scan_source
+from plushsense.dataset.importing.sources import LEFT_OUT, ScanSpec, SourceFile, SourceScan, read_mapping
 from plushsense.dataset.index import rebuild_index
+from plushsense.dataset.quality.measurements import Examination
+from plushsense.dataset.quality.recordings import clock_still
 from plushsense.dataset.store import (
     HEAD,
     RECORDINGS,
-    UNKNOWN_SUBJECT,
+    STREAMS,
     DatasetHead,
     Generation,
+    PersonInfo,
     Progress,
     read_people,
 )
 
 FOLDER = "folder"
-SHOWN = 5
 # Recordings in which channels that are no readings are looked for.
 _SAMPLED = 40
-NO_PEOPLE_OF_PATTERN = Sentence(
-    "the pattern finds no person, so the people are not known, and splits by subject are not possible: put {subject} "
-    "into paths, give its column, or import again with --subjects map.csv (columns file,subject)",
-    reason="people_unknown",
-)
+_PREVIEWED_ROWS, _PREVIEWED_FILES = 10, 5
 
 
-@dataclass(frozen=True)
-class ImportOptions:
-    """Options of an import; ``layout``, ``gestures`` and ``mapping`` (file to person) may be None.
+class ScanSettings(TypedDict, total=False):
+    """Settings by which a source is read; none is needed.
 
-    ``person``, ``guess_layout`` and ``streams`` are as in `import_recordings`.
-
-    ``layout_origin`` describes the layout in messages; ``columns`` maps roles to column names; ``new_folder`` creates
-    a temporary folder for unpacked or converted files.
+    Attributes:
+        layout: the sensor layout, its name or path; not needed with ``add_to``, for sessions of PlushSense, and for
+            files whose header names all channels of one built-in layout.
+        gestures: the gesture set; by default ``plush-18`` for plush layouts, else inferred from the labels.
+        subjects: "folder" (the folder is the person) or the path of a mapping file ``file,subject``.
+        columns: the column of a table by role (``{"label": "activity"}``); in XDF files the ``stream`` and the
+            ``markers`` by name or ``#number``, and the labels of channels.
+        limits: limits of unpacking a zip.
+        person: the person of files that name none: those directly in ``source``, in folders of gestures, and XDF files
+            and tables without a person. "" refuses them; None takes the name of the folder where there is one.
+        guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
+        pattern: description of files of other projects, or the path of its TOML file.
+        streams: folders of people, each with its ``fulldatastream.csv``, in which recordings without a known person are
+            found: they get the person and the place in the stream, which undoes their anonymisation.
     """
 
-    layout: Layout | None
-    gestures: GestureSet | None
-    mapping: Mapping[str, str] | None
-    new_folder: Callable[[str], Path]
-    layout_origin: str = "the given layout"
-    columns: Mapping[str, str] = field(default_factory=dict)
-    limits: UnpackLimits = field(default_factory=UnpackLimits)
-    person: str | None = None
-    guess_layout: bool = False
-    pattern: ImportPattern | None = None
-    streams: Path | None = None
-
-    def known_layout(self, own: Layout | None, files: Iterable[Path]) -> tuple[Layout, list[str]]:
-        """Return the layout ``own`` of the source, else the given one, else the one that the header of a file names.
-
-        The second value are notes. Raises ConfigError if there is none, or several fit.
-        """
-        if (layout := own or self.layout) is not None:
-            return layout, []
-        files = list(files)
-        found, why = matching_layouts(files), "the header of the files has its channels"
-        if not found and (found := recorded_layouts(files)):
-            why = f"the files have its {len(found[0].csv.columns)} columns"
-        if len({layout.csv.columns for layout in found}) == 1 < len(found):
-            # They differ in the clock that the toy sends. Files without rows tell nothing, and are refused later.
-            found = (readable_layouts(files, [layout.name for layout in found]) or found[::-1])[:1]
-            why += f", the last one a {'clock' if DEVICE_MS in found[0].wire else 'delay'}"
-        elif self.guess_layout and len(found) != 1:
-            found = readable_layouts(files, [layout.name for layout in found])[:1]
-        if len(found) == 1:
-            name = found[0].name
-            message = f"the layout is '{name}', as {why}"
-            return found[0], [Sentence(message, reason="layout_guessed", layout=name)]
-        fit = f"The header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
-        raise ConfigError(
-            f"--layout is needed: accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
-            f"names the channels (see docs/importing.md). {fit}For files of another form, let --guess FILE.toml write "
-            "a pattern.",
-            reason="layout_unknown",
-        )
-
-    def known_gestures(self, layout: Layout) -> GestureSet | None:
-        """Return the gesture set; None if it is to be inferred from the labels."""
-        if self.gestures is None and layout.name.startswith("plush"):
-            return load_gestures("plush-18")
-        return self.gestures
+    layout: Layout | str | Path | None
+    gestures: GestureSet | str | Path | None
+    subjects: str | Path
+    columns: Mapping[str, str]
+    limits: UnpackLimits
+    person: str | None
+    guess_layout: bool
+    pattern: ImportPattern | str | Path | None
+    streams: str | Path | None
 
 
-def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = None) -> SourceScan:
-    """Search a folder for sessions of PlushSense's recorder, XDF files, and recordings by the folder structure.
+class ImportSettings(ScanSettings, total=False):
+    """Settings of an import: those of `ScanSettings`, and what is said about the data set.
 
-    ``around`` is the folder of the zip if ``source`` was unpacked from one; a mark of a simulation counts there too.
+    Attributes:
+        name: name of the data set; by default that of the source.
+        licence: licence of the data set.
+        consent: statement on the consent of the people.
+        simulated: whether the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
+        people: the path of a people's table, see `dataset.store.read_people`.
+        adopt_proposals: whether the layout of a new data set takes what its recordings prove (see `propose_settings`):
+            rate, gap, offsets, units, valid ranges, self-calibration. Everything else is only reported.
     """
-    all_files = source_files(source)
-    simulated = is_simulation(around or source, all_files)
-    files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
-    backups = Backups.among(source, files)
-    choices, of_choices, unread = choices_of(source, backups.kept)
-    files = [f for f in backups.kept if f not in of_choices]
-    restored = {choice.name.casefold() for choice in backups.choices}
-    choices = [choice for choice in choices if choice.name.casefold() not in restored] + backups.choices
-    refused += [SourceFile(f, LEFT_OUT, reason=why) for f, why in backups.left_out.items()]
-    refused += [SourceFile(f, LEFT_OUT, reason=REPLACED) for f in backups.originals]
-    refused += [SourceFile(f, "" if why else LEFT_OUT, reason=why or CHOSEN) for f, why in of_choices.items()]
-    sessions = read_sessions(files)
-    own = common_layout(sessions, options.layout, options.layout_origin)
-    layout, notes = options.known_layout(own, [*files, *backups.originals.values()])
-    gestures = options.known_gestures(layout)
-    in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
-    rest = sorted(set(files) - set(in_session)) if in_session else files
-    plain = [f for f in rest if not is_xdf(f)]
-    if options.columns and len(plain) == len(rest):
-        role = next(iter(options.columns))
-        raise ConfigError(
-            f"--column {role}=… is for a table or XDF files; '{source}' is a folder: describe it with --pattern FILE."
-        )
-    mapping = None if options.mapping is None else dict(options.mapping)
-    shape = "labelled-rows" if layout.is_labelled else "gesture-recorder"
-    classified = (
-        refused
-        + list(classify_session_files(sessions, in_session))
-        + classify_files(shape, source, plain, mapping, gestures, options.person)
-    )
-    classified = [
-        replace(f, source=backups.originals[f.source], cut=f.source)
-        if f.kind == RECORDINGS and f.source in backups.originals
-        else f
-        for f in classified
-    ]
-    classified = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in classified]
-    notes += moved_note(classified)
-    people, more = people_of(sessions)
-    notes += [*more, *unread]
-    search = SourceScan(
-        layout, gestures, shape if rest else "sessions", classified, people, notes=notes, choices=choices
-    )
-    files_of: dict[tuple[str, str], list[str]] = {}
-    for file in filter(is_xdf, rest):
-        name = printable_path(file.relative_to(source))
-        person = None if file.parent == around else file.parent.resolve().name
-        if file.parent == source and options.person is not None:
-            person = options.person or None
-        if mapping is not None:
-            person = mapping.get(name, mapping.get(file.name))
-        try:
-            files_of.setdefault(_add_xdf(file, name, person, options, search), []).append(name)
-        except FileFormatError as cause:
-            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
-    for (subject, session), names in files_of.items():
-        if len(names) > 1:
-            message = f"{len(names)} files are the session '{session}' of '{subject}': {', '.join(names[:SHOWN])}"
-            values = {"n": len(names), "session": session, "person": subject, "files": ", ".join(names[:SHOWN])}
-            search.notes.append(Sentence(message, reason="session_shared", **values))
-    if mapping is not None:
-        present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
-        if missing := [name for name in mapping if name not in present]:
-            listed = ", ".join(f"'{m}'" for m in missing[:SHOWN]) + (", …" if len(missing) > SHOWN else "")
-            search.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
-    search.simulated = simulated or any(not isinstance(h, str) and h.simulated for h in sessions.values())
-    return search
 
-
-def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = None) -> SourceScan:
-    """Search a folder or a file for the files that the pattern in ``options`` describes, and convert them.
-
-    ``around`` is as in `scan_folder`.
-    """
-    pattern = options.pattern
-    assert pattern is not None
-    base = source if source.is_dir() else source.parent
-    all_files = source_files(source) if source.is_dir() else [source]
-    files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
-    layout, notes = options.known_layout(None, files)
-    check_roles(pattern.columns, layout, "[columns] of the pattern: ")
-    search = SourceScan(layout, options.known_gestures(layout), PATTERN, [], notes=notes)
-    search.simulated = is_simulation(around or base, all_files)
-    search.found += [replace(f, origin=printable_path(f.source.relative_to(base))) for f in refused]
-    tables = TableImport(options.new_folder("converted"), layout, pattern)
-    remarks: list[tuple[str, str]] = []
-    of_labels = _add_intervals(base, files, pattern, tables, search)
-    for file in (f for f in files if f not in of_labels):
-        relative = file.relative_to(base).as_posix()
-        name = printable_path(file.relative_to(base))
-        place = pattern.match(relative)
-        if place is None:
-            excluded = pattern.excluded_by(relative)
-            reason = (
-                f"excluded by '{excluded}'" if excluded else f"fits no path of the pattern: {', '.join(pattern.paths)}"
-            )
-            search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason=reason))
-            continue
-        person = options.person or (UNKNOWN_SUBJECT if options.person is None else None)
-        if options.mapping is not None:
-            person = options.mapping.get(relative, options.mapping.get(file.name))
-        try:
-            for entry in tables.convert(file, name, person, place):
-                if isinstance(entry, Sentence):
-                    remarks.append((entry.values["file"], entry.values["note"]))
-                else:
-                    search.found.append(entry)
-        except FileFormatError as cause:
-            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
-    search.found += tables.origins()
-    search.notes += group_flags(remarks, "files")
-    if any(f.subject == UNKNOWN_SUBJECT for f in search.found):
-        search.notes.append(NO_PEOPLE_OF_PATTERN)
-    return search
-
-
-def _add_intervals(
-    base: Path, files: Iterable[Path], pattern: ImportPattern, tables: TableImport, search: SourceScan
-) -> set[Path]:
-    """Read the files of intervals that the pattern describes; return their paths."""
-    found: set[Path] = set()
-    for file in files:
-        place = pattern.interval_place(file.relative_to(base).as_posix())
-        if place is None:
-            continue
-        found.add(file)
-        name = printable_path(file.relative_to(base))
-        try:
-            tables.intervals.append(read_intervals(file, name, pattern, place))
-        except FileFormatError as cause:
-            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
-        else:
-            search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason="its intervals label other files"))
-    return found
-
-
-def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
-    """Unpack a zip beside the new data set and search it."""
-    # As if the user had unpacked it: recordings at the top belong to the person with the name of the zip.
-    folder = options.new_folder("unpacked") / folder_name(path.stem)
-    folder.mkdir()
-    refused = unpack(path, folder, options.limits)
-    if any(folder.rglob(HEAD)):
-        message = f"'{path}' holds a data set: unpack it and open the folder, it needs no import."
-        raise DatasetError(message, reason="import_of_dataset", name=path.name)
-    options = replace(options, person=options.person or None)
-    scan = scan_folder if options.pattern is None else scan_pattern
-    search = scan(folder, options, around=path.resolve().parent)
-    search.found += [SourceFile(path, "", origin=printable_path(Path(name)), reason=reason) for name, reason in refused]
-    return search
-
-
-def scan_xdf(path: Path, options: ImportOptions) -> SourceScan:
-    """Convert and search an XDF file."""
-    search = _scan_of_file(path, "xdf", options)
-    person = (options.mapping or {}).get(path.name) or options.person or None
-    _add_xdf(path, path.name, person, options, search)
-    return search
-
-
-def _scan_of_file(path: Path, shape: str, options: ImportOptions, own: Layout | None = None) -> SourceScan:
-    layout, notes = options.known_layout(own, [path])
-    simulated = is_simulation(path.resolve().parent, [])
-    return SourceScan(layout, options.known_gestures(layout), shape, [], notes=notes, simulated=simulated)
-
-
-def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, search: SourceScan) -> tuple[str, str]:
-    """Convert an XDF file, and add its recordings and notes to ``search``; return the person and the session."""
-    subject, session = person_and_session(path, person)
-    if options.mapping is not None:
-        subject = person
-    if subject is None:
-        raise FileFormatError(
-            f"the person of '{name}' is not known: name the person with --subjects map.csv (file,subject), or call the "
-            "file sub-<code>_ses-<session>.xdf as LabRecorder does",
-            reason="person_unknown",
-        )
-    folder = options.new_folder("converted")
-    choices, limits = options.columns, options.limits
-    _add(read_xdf(path, name, folder, subject, session, search.layout, search.gestures, choices, limits), search)
-    return subject, session
-
-
-def scan_table(path: Path, options: ImportOptions) -> SourceScan:
-    """Convert and search a table with one row per sample."""
-    if parse_name(path.name) is not None:
-        raise DatasetError(f"'{path}' is one recording: give the folder that holds the people's folders.")
-    search = _scan_of_file(path, "table", options)
-    check_roles(options.columns, search.layout)
-    person = (options.mapping or {}).get(path.name) or options.person or None
-    pattern = ImportPattern(columns=dict(options.columns))
-    tables = TableImport(options.new_folder("converted"), search.layout, pattern)
-    _add(tables.convert(path, path.name, person), search)
-    return search
-
-
-def scan_windows(path: Path, options: ImportOptions) -> SourceScan:
-    """Convert and search windows that MATLAB saved."""
-    sets = read_windows(path, path.name)
-    layout = windows_layout(sets[0].windows[0].shape[1], options.layout, path.name)
-    search = _scan_of_file(path, WINDOWS, options, layout)
-    search.simulated = search.simulated or sets[0].simulated
-    person = (options.mapping or {}).get(path.name)
-    _add(write_windows(path, path.name, options.new_folder("converted"), person, search.layout, sets), search)
-    return search
-
-
-def _add(entries: Iterable[SourceFile | str], search: SourceScan) -> None:
-    """Add ``entries`` to ``search``: files to its files, texts to its notes."""
-    for entry in entries:
-        if isinstance(entry, str):
-            search.notes.append(entry)
-        else:
-            search.found.append(entry)
-
-
-FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
-    ".zip": scan_zip,
-    **dict.fromkeys(ENDINGS, scan_xdf),
-    ".parquet": scan_table,
-    ".csv": scan_table,
-    ".mat": scan_windows,
-}
+    name: str | None
+    licence: str
+    consent: str
+    simulated: bool
+    people: str | Path | None
+    adopt_proposals: bool | None
 
 
 @contextmanager
@@ -389,141 +114,183 @@ def _temporary_folders(dest: Path) -> Iterator[Callable[[str], Path]]:
         yield create
 
 
-def scan_source(source: Path, options: ImportOptions) -> SourceScan:
-    """Search ``source``: a folder, or a file in one of the ``FORMATS``.
-
-    Raises:
-        DatasetError: if it is neither, cannot be read, or contains nothing to import.
-    """
-    try:
-        if options.pattern is not None and source.exists() and source.suffix.lower() != ".zip":
-            search = scan_pattern(source, options)
-        elif source.is_dir():
-            search = scan_folder(source, options)
-        elif source.is_file():
-            scan = next((scan for ending, scan in FORMATS.items() if source.name.lower().endswith(ending)), None)
-            if scan is None:
-                raise DatasetError(
-                    f"'{source}' cannot be imported: give a folder, or a file that ends in {', '.join(FORMATS)}.",
-                    reason="file_no_recording",
-                )
-            search = scan(source, options)
-        else:
-            raise DatasetError(
-                f"There is no '{source}': give the recorder's folder, or a file that ends in {', '.join(FORMATS)}."
-            )
-    except OSError as cause:
-        raise DatasetError(f"'{source}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
-    except FileFormatError as cause:
-        raise FileFormatError(f"'{source}': {cause}.", reason=cause.reason, **cause.values) from None
-    if options.streams is not None:
-        find_people(search, options.streams)
-    if not any(f.kind in ("recordings", "streams") for f in search.found):
-        first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
-        unknown = any(getattr(f.reason, "reason", "") == "person_unknown" for f in search.found)
-        expected = "<label>_<epoch ms>_<rows>.csv in a folder per person"
-        if options.pattern is not None:
-            expected = f"files that fit {', '.join(options.pattern.paths)}"
-        elif search.shape == "labelled-rows":
-            expected += " (or CSVs with a label column)"
-        raise DatasetError(
-            f"'{source}' holds no recording: expected {expected}; found "
-            f"{plural(len(search.found), 'other file')}.{first}"
-            + ("" if options.pattern is not None else " Other files can be described with --pattern FILE.toml."),
-            reason="person_unknown" if unknown else "import_nothing",
-            n=len(search.found),
-        )
-    return search
-
-
-_OF_ADDED = (SELF_CALIBRATION, "valid_min", "valid_max")
-
-
-def propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
-    """Measure the data set of an import; add what fits it better to the summary, and if ``adopting`` to its layout.
-
-    A layout adopts only what is proven, and a note says what that was. Warn of channels that are no readings.
-
-    If recordings were ``added``, only failed readings and sensors that differ are proposed on: the layout has been
-    chosen.
-    """
-    used = done.dataset.used
-    some = used[:: max(1, len(used) // _SAMPLED)][:_SAMPLED]
-    done.notes += counters_note(done.dataset.layout, [done.dataset.read(recording) for recording in some])
-    sensors = find_sensors(done.dataset)
-    done.sensors = [sensor.to_dict() for sensor in sensors]
-    found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key in _OF_ADDED]
-    head = done.dataset.head
-    layout = adopt(head.layout, found) if adopting else head.layout
-    reasons: dict[str, list[str]] = {}
-    for p in found:
-        adopted = adopting and p.proven and (p.key != SELF_CALIBRATION or set(p.value) <= set(layout.self_calibration))
-        done.proposals.append({**p.to_dict(), "advice": p.advice(adopted), "adopted": adopted})
-        if adopted:
-            reasons.setdefault(p.reason, []).append(p.setting)
-    if reasons:
-        settings = [f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()]
-        what = [text for texts in reasons.values() for text in texts]
-        message = f"adopted in the layout (--no-adopt keeps it as given): {'; '.join(settings)}"
-        done.notes.append(Sentence(message, reason="adopted", settings=what))
-    if layout != head.layout:
-        head = replace(head, layout=layout)
-        write_file(done.dataset.path / HEAD, head.to_toml())
-        done.dataset = rebuild_index(done.dataset.path, head).dataset
-
-
-def _options(
-    new_folder: Callable[[str], Path],
-    layout: Layout | str | Path | None = None,
-    gestures: GestureSet | str | Path | None = None,
-    subjects: str | Path = FOLDER,
-    columns: Mapping[str, str] | None = None,
-    limits: UnpackLimits | None = None,
-    person: str | None = None,
-    guess_layout: bool = False,
-    pattern: ImportPattern | str | Path | None = None,
-    streams: str | Path | None = None,
-) -> ImportOptions:
-    """Load the files that options of an import name; a layout, gestures or columns override those of the pattern."""
-    if streams is not None and (str(subjects) != FOLDER or person or pattern is not None):
+def _scan_spec(new_folder: Callable[[str], Path], given: ScanSettings) -> ScanSpec:
+    """Load the files that settings name; a layout, gestures or columns override those of the pattern."""
+    layout, gestures, pattern = given.get("layout"), given.get("gestures"), given.get("pattern")
+    columns, streams, subjects = given.get("columns") or {}, given.get("streams"), given.get("subjects", FOLDER)
+    if streams is not None and (str(subjects) != FOLDER or given.get("person") or pattern is not None):
         raise ConfigError("--streams tells the people of recordings: leave --subjects, --pattern and a person out.")
     if pattern is not None and not isinstance(pattern, ImportPattern):
         pattern = read_pattern(pattern)
     if pattern is not None:
-        pattern = replace(pattern, columns={**pattern.columns, **(columns or {})})
+        pattern = replace(pattern, columns={**pattern.columns, **columns})
         layout = pattern.known_layout() if layout is None else layout
         gestures = pattern.known_gestures() if gestures is None else gestures
-    return ImportOptions(
+    return ScanSpec(
         layout if isinstance(layout, Layout) or layout is None else load_layout(layout),
         gestures if isinstance(gestures, GestureSet) or gestures is None else load_gestures(gestures),
         None if str(subjects) == FOLDER else read_mapping(Path(subjects)),
         new_folder,
-        columns=columns or {},
-        limits=limits or UnpackLimits(),
-        person=person,
-        guess_layout=guess_layout,
+        columns=columns,
+        limits=given.get("limits") or UnpackLimits(),
+        person=given.get("person"),
+        guess_layout=given.get("guess_layout", False),
         pattern=pattern,
         streams=None if streams is None else Path(streams),
     )
 
 
-def _grid(layout: Layout) -> list[tuple[str, float]]:
-    """Return the name and the step of each channel."""
-    return [(channel.name, channel.step) for channel in layout.channels]
-
-
-def preview_import(source: str | Path, **given: Any) -> ImportPreview:
+def preview_import(source: str | Path, **settings: Unpack[ScanSettings]) -> ImportPreview:
     """Return what `import_recordings` would understand of ``source``; nothing is written.
-
-    Args:
-        given: layout, gestures, subjects, columns, limits, person, guess_layout, pattern and streams of
-            `import_recordings`.
 
     Raises:
         DatasetError: if there is nothing to import.
     """
     with temporary_folder() as place, _temporary_folders(place / "new") as folder:
-        return preview(scan_source(Path(source), _options(folder, **given)))
+        return _preview(scan_source(Path(source), _scan_spec(folder, settings)))
+
+
+def _preview(scan: SourceScan) -> ImportPreview:
+    """Read some rows of the files that a scan has found."""
+    files = [f for f in scan.found if f.kind in (RECORDINGS, STREAMS)]
+    recordings = [f for f in files if f.kind == RECORDINGS]
+    named = {f.source: f.gesture or name.label for f in recordings if (name := parse_name(f.source.name)) is not None}
+    some = recordings or files
+    some = some[:: max(1, len(some) // _PREVIEWED_FILES)][:_PREVIEWED_FILES]
+    rows, frames, flags = list[PreviewRow](), list[Frames](), list[tuple[str, str]]()
+    rejected = [FileReason(f.origin, f.reason) for f in scan.found if not f.kind]
+    for file in some:
+        try:
+            read = (read_stream if file.kind == STREAMS else read_recording)(file.source, scan.layout)
+        except FileFormatError as cause:
+            rejected.append(FileReason(file.origin, str(cause)))
+            continue
+        frames.append(read.frames)
+        first = read.frames.slice(0, -(-_PREVIEWED_ROWS // len(some)))
+        rows += _preview_rows(file, named.get(file.source, ""), first, scan.layout)
+        flags += [(file.origin, str(issue.message)) for issue in clock_still(Examination(read.frames, scan.layout))]
+    notes = [*scan.notes, *counters_note(scan.layout, frames), *group_flags(flags)]
+    if scan.gestures is not None and (note := unknown_labels(scan.gestures, named.values())):
+        notes.append(note)
+    return ImportPreview(
+        scan.layout.name,
+        len(recordings),
+        len(files) - len(recordings),
+        sorted({f.subject for f in files}),
+        dict(sorted(Counter(named.values()).items())),
+        tuple(rows[:_PREVIEWED_ROWS]),
+        tuple(rejected),
+        tuple(FileReason(f.origin, f.reason) for f in scan.found if f.kind == LEFT_OUT),
+        tuple(notes),
+    )
+
+
+def _preview_rows(file: SourceFile, gesture: str, frames: Frames, layout: Layout) -> Iterator[PreviewRow]:
+    low, high = layout.valid_min_int, layout.valid_max_int
+    steps = [c.step for c in layout.channels]
+    for k, row in enumerate(frames.values):
+        valid = ((row >= low) & (row <= high)).tolist()
+        values = [float(f"{v * s:.9g}") if ok else None for v, s, ok in zip(row.tolist(), steps, valid, strict=True)]
+        label = gesture if frames.labels is None else str(frames.labels[k])
+        named = dict(zip(layout.names, values, strict=True))
+        yield PreviewRow(file.origin, file.subject, file.session, label, int(frames.device_ms[k]), named)
+
+
+def import_recordings(
+    source: str | Path,
+    dest: str | Path,
+    *,
+    add_to: bool = False,
+    progress: Progress | None = None,
+    **settings: Unpack[ImportSettings],
+) -> ImportResult:
+    """Create a data set at ``dest`` from recordings, or add them to an existing one.
+
+    Args:
+        source: a folder that a recorder wrote (sessions, a folder per person or per label), a zip of one, an XDF file,
+            one table (.csv, .parquet), or windows that MATLAB saved (.mat).
+        dest: a new or empty folder for the data set; with ``add_to`` the existing data set.
+        progress: called with (files done, number of files).
+        settings: see `ImportSettings` and `ScanSettings`.
+
+    Returns:
+        The result. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
+
+    Raises:
+        DatasetError: if there is nothing to import, or ``dest`` is not empty.
+    """
+    began = time.perf_counter()
+    source, dest = Path(source), Path(dest)
+    if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
+        raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a folder outside of it.")
+    if not add_to and (dest / HEAD).is_file():
+        raise DatasetError(
+            f"'{dest}' is a data set already: add to it with --add (Python: add_to=True), or give another folder; "
+            "nothing is overwritten.",
+            reason="name_exists",
+            name=dest.name,
+        )
+    with _temporary_folders(dest) as new_folder:
+        run = _add if add_to else _create
+        result = run(source, dest, _scan_spec(new_folder, settings), settings, progress)
+    return replace(result, seconds=time.perf_counter() - began)
+
+
+def _read_people(settings: ImportSettings) -> Mapping[str, PersonInfo]:
+    people = settings.get("people")
+    if people is not None and not Path(people).exists():
+        raise DatasetError(f"There is no people's file '{people}': check the path.")
+    return {} if people is None else read_people(Path(people))
+
+
+def _create(
+    source: Path, dest: Path, spec: ScanSpec, settings: ImportSettings, progress: Progress | None
+) -> ImportResult:
+    """Create a data set from a source."""
+    people = _read_people(settings)
+    scan = scan_source(source, spec)
+    head = DatasetHead(
+        name=settings.get("name") or (source.resolve().name if source.is_dir() else source.stem),
+        layout=scan.layout,
+        gestures=scan.gestures or GestureSet("inferred", (), inferred=True),
+        licence=settings.get("licence", ""),
+        consent=settings.get("consent", ""),
+        source=scan.shape,
+        simulated=scan.simulated or settings.get("simulated", False),
+    )
+    return propose(
+        create_dataset(source, dest, scan, head, people, progress), settings.get("adopt_proposals") is not False
+    )
+
+
+def _add(source: Path, dest: Path, spec: ScanSpec, settings: ImportSettings, progress: Progress | None) -> ImportResult:
+    """Add a source to a data set."""
+    if any(settings.get(key) for key in ("adopt_proposals", "name", "licence", "consent", "streams")):
+        raise ConfigError(
+            "--add keeps the layout, name, licence, consent statement and people of the data set: leave "
+            "--adopt, --name, --licence, --consent and --streams out."
+        )
+    people, generation, head = _read_people(settings), Generation.of(dest), DatasetHead.read(dest)
+    _check_layout(dest, head.layout, spec.layout, named=settings.get("layout") is not None)
+    # An inferred set cannot decide which markers of an XDF file are gestures.
+    of_set = spec.gestures if head.gestures.inferred else head.gestures
+    of_dataset = replace(spec, layout=head.layout, gestures=of_set, layout_origin="that of the data set")
+    scan = scan_source(source, of_dataset)
+    scan.simulated |= settings.get("simulated", False)
+    try:
+        result = add_to_dataset(dest, scan, spec.gestures, people, progress, generation)
+    except OSError as cause:
+        generation.check()
+        raise DatasetError(
+            f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "
+            "before: check the disk and import again."
+        ) from None
+    return propose(result, added=True)
+
+
+def _grid(layout: Layout) -> list[tuple[str, float]]:
+    """Return the name and the step of each channel."""
+    return [(channel.name, channel.step) for channel in layout.channels]
 
 
 def _check_layout(dest: Path, own: Layout, given: Layout | None, named: bool) -> None:
@@ -542,113 +309,46 @@ def _check_layout(dest: Path, own: Layout, given: Layout | None, named: bool) ->
         )
 
 
-def import_recordings(
-    source: str | Path,
-    dest: str | Path,
-    *,
-    layout: Layout | str | Path | None = None,
-    gestures: GestureSet | str | Path | None = None,
-    subjects: str | Path = FOLDER,
-    name: str | None = None,
-    licence: str = "",
-    consent: str = "",
-    simulated: bool = False,
-    progress: Progress | None = None,
-    add_to: bool = False,
-    people: str | Path | None = None,
-    columns: Mapping[str, str] | None = None,
-    limits: UnpackLimits | None = None,
-    adopt_proposals: bool | None = None,
-    person: str | None = None,
-    guess_layout: bool = False,
-    pattern: ImportPattern | str | Path | None = None,
-    streams: str | Path | None = None,
-) -> ImportSummary:
-    """Create a data set at ``dest`` from recordings, or add them to an existing one.
+_OF_ADDED = (SELF_CALIBRATION, "valid_min", "valid_max")
 
-    Args:
-        source: a folder that a recorder wrote (sessions, a folder per person or per label), a zip of one, an XDF file,
-            one table (.csv, .parquet), or windows that MATLAB saved (.mat).
-        dest: a new or empty folder for the data set; with ``add_to`` the existing data set.
-        layout: the sensor layout, its name or path; not needed with ``add_to``, for sessions of PlushSense, and for
-            files whose header names all channels of one built-in layout.
-        gestures: the gesture set; by default ``plush-18`` for plush layouts, else inferred from the labels.
-        subjects: "folder" (the folder is the person) or the path of a mapping file ``file,subject``.
-        simulated: whether the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
-        progress: called with (files done, number of files).
-        people: the path of a people's table, see `dataset.store.read_people`.
-        columns: the column of a table by role (``{"label": "activity"}``); in XDF files the ``stream`` and the
-            ``markers`` by name or ``#number``, and the labels of channels.
-        limits: limits of unpacking a zip.
-        adopt_proposals: whether the layout of a new data set takes what its recordings prove (see `propose_settings`):
-            rate, gap, offsets, units, valid ranges, self-calibration. Everything else is only reported.
-        person: the person of files that name none: those directly in ``source``, in folders of gestures, and XDF files
-            and tables without a person. "" refuses them; None takes the name of the folder where there is one.
-        guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
-        pattern: description of files of other projects, or the path of its TOML file.
-        streams: folders of people, each with its ``fulldatastream.csv``, in which recordings without a known person are
-            found: they get the person and the place in the stream, which undoes their anonymisation.
 
-    Returns:
-        The summary. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
+def propose(result: ImportResult, adopting: bool = False, added: bool = False) -> ImportResult:
+    """Measure the data set of an import; return its result with what fits it better, and if ``adopting`` adopt that.
 
-    Raises:
-        DatasetError: if there is nothing to import, or ``dest`` is not empty.
+    A layout adopts only what is proven, and a note says what that was. Warn of channels that are no readings.
+
+    If recordings were ``added``, only failed readings and sensors that differ are proposed on: the layout has been
+    chosen.
     """
-    began = time.perf_counter()
-    source, dest = Path(source), Path(dest)
-    if people is not None and not Path(people).exists():
-        raise DatasetError(f"There is no people's file '{people}': check the path.")
-    people_info = {} if people is None else read_people(Path(people))
-    if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
-        raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a folder outside of it.")
-    if not add_to and (dest / HEAD).is_file():
-        raise DatasetError(
-            f"'{dest}' is a data set already: add to it with --add (Python: add_to=True), or give another folder; "
-            "nothing is overwritten.",
-            reason="name_exists",
-            name=dest.name,
-        )
-    with _temporary_folders(dest) as new_folder:
-        options = _options(
-            new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern, streams
-        )
-        known, head = options.gestures, None
-        generation = Generation.of(dest)
-        if add_to:
-            if adopt_proposals or name or licence or consent or streams:
-                raise ConfigError(
-                    "--add keeps the layout, name, licence, consent statement and people of the data set: leave "
-                    "--adopt, --name, --licence, --consent and --streams out."
-                )
-            head = DatasetHead.read(dest)
-            _check_layout(dest, head.layout, options.layout, named=layout is not None)
-            # An inferred set cannot decide which markers of an XDF file are gestures.
-            of_set = known if head.gestures.inferred else head.gestures
-            options = replace(options, layout=head.layout, gestures=of_set, layout_origin="that of the data set")
-        search = scan_source(source, options)
-        search.simulated = search.simulated or simulated
-        if head is None:
-            new_head = DatasetHead(
-                name=name or (source.resolve().name if source.is_dir() else source.stem),
-                layout=search.layout,
-                gestures=search.gestures or GestureSet("inferred", (), inferred=True),
-                licence=licence,
-                consent=consent,
-                source=search.shape,
-                simulated=search.simulated,
-            )
-            done = create_dataset(source, dest, search, new_head, people_info, progress)
-            propose(done, adopt_proposals is not False)
-        else:
-            try:
-                done = add_to_dataset(dest, search, known, people_info, progress, generation)
-            except OSError as cause:
-                generation.check()
-                raise DatasetError(
-                    f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "
-                    "before: check the disk and import again."
-                ) from None
-            propose(done, added=True)
-    done.seconds = time.perf_counter() - began
-    return done
+    dataset, used = result.dataset, result.dataset.used
+    some = used[:: max(1, len(used) // _SAMPLED)][:_SAMPLED]
+    notes = counters_note(dataset.layout, [dataset.read(recording) for recording in some])
+    sensors = find_sensors(dataset)
+    found = [p for p in propose_settings(dataset, sensors) if not added or p.key in _OF_ADDED]
+    layout = adopt(dataset.layout, found) if adopting else dataset.layout
+    proposals = [replace(p, adopted=adopting and _is_adopted(p, layout)) for p in found]
+    if adopted := [p for p in proposals if p.adopted]:
+        notes.append(_note_of_adopted(adopted))
+    if layout != dataset.layout:
+        head = replace(dataset.head, layout=layout)
+        write_file(dataset.path / HEAD, head.to_toml())
+        dataset = rebuild_index(dataset.path, head).dataset
+    return replace(
+        result, dataset=dataset, notes=(*result.notes, *notes), proposals=tuple(proposals), sensors=tuple(sensors)
+    )
+
+
+def _is_adopted(proposal: Proposal, layout: Layout) -> bool:
+    """Return whether ``layout``, which adopted what it could, has the proposed setting."""
+    calibrated = proposal.key != SELF_CALIBRATION or set(proposal.value) <= set(layout.self_calibration)
+    return proposal.proven and calibrated
+
+
+def _note_of_adopted(adopted: Sequence[Proposal]) -> Sentence:
+    """Return the note that says what a layout adopted, by reason."""
+    by_reason: dict[str, list[str]] = {}
+    for p in adopted:
+        by_reason.setdefault(p.reason, []).append(p.setting)
+    settings = [f"{', '.join(texts)} ({reason})" for reason, texts in by_reason.items()]
+    message = f"adopted in the layout (--no-adopt keeps it as given): {'; '.join(settings)}"
+    return Sentence(message, reason="adopted", settings=[text for texts in by_reason.values() for text in texts])

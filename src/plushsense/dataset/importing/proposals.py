@@ -1,25 +1,21 @@
-"""Propose settings that fit the recordings: layout by the header of the files; the others by data.
+"""Propose settings that fit the recordings of a data set.
 
 Zero, scale and unit of accelerometers are measured for each session; rate, gap, valid ranges and window over all.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import FileFormatError, LayoutError
-from plushsense.core.layouts import ACCELERATION, DEVICE_MS, MEASURED, Layout, layout_names, load_layout
-from plushsense.core.recorder_csv import parse_name, read_recording
+from plushsense.core.errors import LayoutError
+from plushsense.core.layouts import ACCELERATION, MEASURED, Layout
 from plushsense.core.sentences import join_names
 from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.quality.outliers import find_failed_readings
@@ -64,37 +60,13 @@ Sphere = tuple[Floats, float]
 
 
 @dataclass(frozen=True)
-class Proposal:
-    """A setting that fits the recordings better: the ``key`` of a layout or of window settings, and the reason.
+class SensorSession:
+    """The sensor of a session: the values that stand for zero, and 1 g, None where it was not turned enough to tell."""
 
-    ``groups`` are the sensors (`Sensor.to_dict`) that differ, if that is the reason. ``proven``: whether the recordings
-    leave no doubt, so that a layout may adopt it.
-    """
-
-    key: str
-    value: Any
-    reason: str
-    groups: tuple[dict[str, Any], ...] = ()
-    proven: bool = True
-
-    @property
-    def setting(self) -> str:
-        """The key and its value in words."""
-        if isinstance(self.value, dict):
-            texts = (f"{k} {v if isinstance(v, str) else format(v, 'g')}" for k, v in self.value.items())
-            return f"{self.key}: {', '.join(texts)}"
-        plain = isinstance(self.value, int | float)
-        return f"{self.key} = {format(self.value, 'g') if plain else json.dumps(self.value, ensure_ascii=False)}"
-
-    def advice(self, adopted: bool) -> str:
-        """Say what to do, or what was done if the layout ``adopted`` the proposal."""
-        if self.key == "window_s":
-            return f"try  [windows] {self.setting}  in a --config file"
-        return f"adopted {self.setting}" if adopted else f"give a layout with {self.setting}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON; ``groups`` only if there are any."""
-        return {key: value for key, value in asdict(self).items() if key != "groups" or value}
+    subject: str
+    session: str
+    zero: dict[str, float] | None
+    one_g: float | None
 
 
 @dataclass(frozen=True)
@@ -102,8 +74,6 @@ class Sensor:
     """The accelerometer of some sessions: the values in the files that stand for zero, and 1 g in the unit ``unit``.
 
     ``recognised`` is the unit that 1 g tells, "" if it is not plain. ``radius`` is 1 g in the values of the files.
-    ``sessions`` have ``subject``, ``session``, and ``zero`` and ``one_g`` of their own, None where the sensor was not
-    turned enough to tell.
     """
 
     axes: tuple[str, ...]
@@ -112,7 +82,7 @@ class Sensor:
     one_g: float
     unit: str
     recognised: str
-    sessions: tuple[dict[str, Any], ...]
+    sessions: tuple[SensorSession, ...]
 
     @classmethod
     def of(
@@ -133,7 +103,7 @@ class Sensor:
             return float(f"{fit[1] * steps[0] * abs(channel.scale):.4g}")
 
         known = tuple(
-            {"subject": subject, "session": session, "zero": own and zero(own), "one_g": own and one_g(own)}
+            SensorSession(subject, session, own and zero(own), own and one_g(own))
             for (subject, session), own in sorted(sessions.items())
         )
         radius = float(fit[1] * steps[0])
@@ -148,7 +118,7 @@ class Sensor:
     @property
     def people(self) -> str:
         """The people, the first of many, and the number of sessions if it is another."""
-        names = list(dict.fromkeys(s["subject"] for s in self.sessions))
+        names = list(dict.fromkeys(s.subject for s in self.sessions))
         total = f" ({len(self.sessions)} sessions)" if len(self.sessions) > len(names) else ""
         return join_names(names, most=_NAMED) + total
 
@@ -160,7 +130,7 @@ class Sensor:
             text += f"; that is {self.recognised}"
             if self.unit in _UNITS and self.recognised in _UNITS and self.unit != self.recognised:
                 text += f", but the layout says {self.unit}"
-        own = [s["zero"] for s in self.sessions if s["zero"]]
+        own = [s.zero for s in self.sessions if s.zero]
         if own and len(self.sessions) > 1:
             away = max(math.dist(zero.values(), self.zero.values()) for zero in own) / self.radius
             text += (
@@ -168,10 +138,56 @@ class Sensor:
             )
         return text
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        kept = {key: value for key, value in vars(self).items() if key != "radius"}
-        return {**kept, "axes": list(self.axes), "sessions": list(self.sessions), "summary": self.summary}
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        values = asdict(self)
+        del values["radius"]
+        return {**values, "axes": list(self.axes), "sessions": list(values["sessions"]), "summary": self.summary}
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A setting that fits the recordings better: the ``key`` of a layout or of window settings, and the reason.
+
+    ``groups`` are the sensors that differ, if that is the reason. ``proven``: whether the recordings leave no doubt, so
+    that a layout may adopt it; ``adopted``: whether it did.
+    """
+
+    key: str
+    value: Any
+    reason: str
+    groups: tuple[Sensor, ...] = ()
+    proven: bool = True
+    adopted: bool = False
+
+    @property
+    def setting(self) -> str:
+        """The key and its value in words."""
+        if isinstance(self.value, dict):
+            texts = (f"{k} {v if isinstance(v, str) else format(v, 'g')}" for k, v in self.value.items())
+            return f"{self.key}: {', '.join(texts)}"
+        plain = isinstance(self.value, int | float)
+        return f"{self.key} = {format(self.value, 'g') if plain else json.dumps(self.value, ensure_ascii=False)}"
+
+    @property
+    def advice(self) -> str:
+        """What to do, or what was done if the layout adopted the proposal."""
+        if self.key == "window_s":
+            return f"try  [windows] {self.setting}  in a --config file"
+        return f"adopted {self.setting}" if self.adopted else f"give a layout with {self.setting}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON; ``groups`` only if there are any."""
+        groups = {"groups": [sensor.to_json() for sensor in self.groups]} if self.groups else {}
+        return {
+            "key": self.key,
+            "value": self.value,
+            "reason": self.reason,
+            **groups,
+            "proven": self.proven,
+            "advice": self.advice,
+            "adopted": self.adopted,
+        }
 
 
 def _recognised(one_g: float) -> str:
@@ -179,69 +195,6 @@ def _recognised(one_g: float) -> str:
     off = sorted((abs(math.log(one_g / value)), unit) for unit, value in _UNITS.items())
     plain = off[0][0] <= _UNIT_SHARE and 2 * off[0][0] <= off[1][0]
     return off[0][1] if plain else ""
-
-
-def matching_layouts(files: Iterable[Path]) -> list[Layout]:
-    """Return the built-in layouts with most channels, all of which the header of the first fitting CSV file names."""
-    layouts = [load_layout(name) for name in layout_names()]
-    for path in files:
-        if path.suffix.lower() == ".csv":
-            with path.open(encoding="utf-8-sig", errors="replace") as file:
-                texts = {text.strip().strip('"').casefold() for text in re.split("[,;\t]", file.readline(4096))}
-            found = [
-                layout
-                for layout in layouts
-                for of in (dict(zip(layout.csv.columns, layout.csv.header, strict=True)),)
-                if all({name.casefold(), of.get(name, name).casefold()} & texts for name in layout.names)
-            ]
-            # A layout of an accelerometer also fits files that have more channels.
-            if found:
-                most = max(layout.n_channels for layout in found)
-                return [layout for layout in found if layout.n_channels == most]
-    return []
-
-
-_SAMPLED_FILES, _SAMPLED_BYTES = 3, 200_000
-_SINCE_2001_MS = 978_307_200_000
-
-
-def readable_layouts(files: Iterable[Path], names: Sequence[str] = ()) -> list[Layout]:
-    """Return the built-in layouts (or those in ``names``) that read the first CSV files, the most probable first.
-
-    Layouts that differ only in the firmware's clock read the same files; the files tell a clock from delays.
-    """
-    samples: list[tuple[Path, bytes]] = []
-    for path in files:
-        if path.suffix.lower() == ".csv" and len(samples) < _SAMPLED_FILES:
-            with path.open("rb") as file:
-                data = file.read(_SAMPLED_BYTES)
-            samples.append((path, data if len(data) < _SAMPLED_BYTES else data[: data.rfind(b"\n") + 1]))
-    ranked: list[tuple[int, int, str]] = []
-    for name in names or layout_names():
-        layout, read, delays = load_layout(name), 0, 0
-        for path, data in samples:
-            with contextlib.suppress(FileFormatError):
-                delays += read_recording(path, layout, data).integrated
-                read += 1
-        if read:
-            ranked.append((-read, (DEVICE_MS not in layout.wire) != (delays > 0), name))
-    return [load_layout(name) for _, _, name in sorted(ranked)]
-
-
-def recorded_layouts(files: Iterable[Path]) -> list[Layout]:
-    """Return the built-in layouts that read the first recordings of the authors' recorder which have no header.
-
-    Their truncation script leaves such files. The column of the computer's time must hold times since 2001.
-    """
-    named = [path for path in files if parse_name(path.name) is not None][:_SAMPLED_FILES]
-
-    def reads(layout: Layout, path: Path) -> bool:
-        with contextlib.suppress(FileFormatError):
-            host = read_recording(path, layout).frames.host_ms
-            return host is not None and float(np.median(host)) > _SINCE_2001_MS
-        return False
-
-    return [layout for layout in map(load_layout, layout_names()) if named and all(reads(layout, f) for f in named)]
 
 
 def propose_settings(dataset: Dataset, sensors: Sequence[Sensor] | None = None) -> list[Proposal]:
@@ -337,7 +290,13 @@ def _sensors_of(dataset: Dataset, vector: tuple[str, ...]) -> Iterator[Sensor]:
     groups: list[Sphere] = []
     left = enough.copy()
     fits = [fit for fit in (everything, *pooled, *own) if fit is not None]
-    on = np.array([_errors(fit, points, at, len(sessions)) <= _ON_SPHERE for fit in fits])
+    lies = list[NDArray[np.bool_]]()
+    for fit in fits:
+        lies.append(_errors(fit, points, at, len(sessions)) <= _ON_SPHERE)
+        if lies[-1][enough].all():
+            # No other fit has more sessions; with hundreds of sessions, their own would take seconds.
+            break
+    on = np.array(lies)
     while fits and (on & left).any():
         best = int((on & left).sum(axis=1).argmax())
         fit = _sphere(points[(on[best] & left)[at]]) or fits[best]
@@ -397,9 +356,8 @@ def _zeros(layout: Layout, sensors: Sequence[Sensor]) -> Iterator[Proposal]:
         yield Proposal("offset", offset, f"held still, {'; '.join(reasons)}")
     if different:
         axes = list(dict.fromkeys(name for sensor in different for name in sensor.axes))
-        groups = tuple(sensor.to_dict() for sensor in different)
         reason = f"the accelerometers of the sessions differ in zero or scale: {'; '.join(several)}"
-        yield Proposal(SELF_CALIBRATION, axes, reason, groups)
+        yield Proposal(SELF_CALIBRATION, axes, reason, tuple(different))
 
 
 def _units(layout: Layout, sensors: Sequence[Sensor]) -> Iterator[Proposal]:

@@ -25,6 +25,7 @@ from plushsense.dataset.importing.sources import SourceFile
 from plushsense.dataset.importing.tables import (
     ConvertedSource,
     LabelledSegment,
+    SessionTarget,
     usable_rows,
     whole_steps,
     write_session,
@@ -201,18 +202,6 @@ def _session(sets: Sequence[str]) -> str:
     return runs[0][0] if len(runs) == 1 else " ".join(f"{name} {n}" for name, n in runs)
 
 
-def sets_of_session(session: str, windows: int) -> list[str]:
-    """Return the set of each of the ``windows`` of a recording, as many as it had in the file; [] if it was in none."""
-    names, counts = session.split()[::2], session.split()[1::2]
-    if not names or not set(names) <= {name for name, *_ in SETS}:
-        return []
-    if not counts:
-        return names * windows if len(names) == 1 else []
-    if len(counts) != len(names) or not all(n.isascii() and n.isdigit() and len(n) < 7 for n in counts):
-        return []
-    return [name for name, n in zip(names, counts, strict=True) for _ in range(int(n))]
-
-
 def _shift(one: Windows, other: Windows) -> int:
     """Return after how many rows of ``one`` the window ``other`` begins; 0 if they do not overlap by half."""
     for row in np.flatnonzero((one == other[0]).all(axis=1)).tolist():
@@ -280,6 +269,5 @@ def write_windows(
             clocks.append(begin + np.round(np.arange(len(r.values)) * 1000.0 / layout.rate_hz).astype(np.int64))
             begin = int(clocks[-1][-1]) + _APART_MS
         frames = Frames(values, np.concatenate(clocks))
-        yield from write_session(
-            folder / str(number), subject or UNKNOWN_SUBJECT, name, frames, cuts, layout, original, with_stream=False
-        )
+        target = SessionTarget(folder / str(number), subject or UNKNOWN_SUBJECT, name, layout)
+        yield from write_session(target, original, frames, cuts, with_stream=False)

@@ -1,34 +1,34 @@
-"""Find the recordings in a source folder: kind, person and session of each file.
-
-Three folder structures are supported: sessions of PlushSense's recorder, folders of the GestureRecorder (by person, or
-by label after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a session, the
-name of the nearest folder is the person.
-"""
+"""The files of a source, what an import knows about it before it reads them, and the result of its scan."""
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
-from plushsense.core.errors import BadInput, DatasetError
-from plushsense.core.gestures import NOBODY, GestureSet, plain_label
-from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence, plural
+import numpy as np
+
+from plushsense.core.errors import BadInput, ConfigError, DatasetError, FileFormatError
+from plushsense.core.gestures import GestureSet, load_gestures
+from plushsense.core.layouts import DEVICE_MS, Layout, layout_names, load_layout
+from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name, read_recording
+from plushsense.core.sentences import Sentence
 from plushsense.core.toml import read_toml
+from plushsense.dataset.importing.archives import DEVICE_NAME, UnpackLimits
+from plushsense.dataset.importing.pattern import ImportPattern
 from plushsense.dataset.importing.truncation import Choice
-from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo, read_csv_rows
-from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
+from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, PersonInfo, read_csv_rows
 
 COMPANIONS = "companions"
 LEFT_OUT = "left out"
-
-_ASK = (
-    "import from the folder that holds one folder a person, or name the people with --subjects map.csv (file,subject)"
-)
+PATTERN, WINDOWS = "pattern", "windows"
+SHOWN = 5
+_SAMPLED_FILES, _SAMPLED_BYTES = 3, 200_000
+_SINCE_2001_MS = 978_307_200_000
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class SourceFile:
 
 @dataclass
 class SourceScan:
-    """Result of searching a source: every file once (``found``), and layout, gestures and people of its sessions.
+    """Result of a scan of a source: every file once (``found``), and layout, gestures and people of its sessions.
 
     ``choices`` are those of the authors' truncation script. ``streams_named`` is whether streams were searched for the
     people.
@@ -65,12 +65,34 @@ class SourceScan:
     layout: Layout
     gestures: GestureSet | None
     shape: str
-    found: list[SourceFile]
+    found: list[SourceFile] = field(default_factory=list)
     people: list[PersonInfo] = field(default_factory=list)
     simulated: bool = False
     notes: list[str] = field(default_factory=list)
     choices: list[Choice] = field(default_factory=list)
     streams_named: bool = False
+
+    def add(self, entries: Iterable[SourceFile | str]) -> None:
+        """Add files to those found, and texts to the notes."""
+        for entry in entries:
+            if isinstance(entry, str):
+                self.notes.append(entry)
+            else:
+                self.found.append(entry)
+
+    @contextmanager
+    def refusing(self, file: Path, name: str) -> Iterator[None]:
+        """Add ``file`` as refused, with the reason, if it turns out to be unreadable; ``name`` is that in messages."""
+        try:
+            yield
+        except FileFormatError as cause:
+            self.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+
+
+def folder_name(code: str, otherwise: str = UNKNOWN_SUBJECT) -> str:
+    """Return a folder name for ``code`` that is valid on any system and inside the data set."""
+    name = "".join(c if c.isalnum() or c in "-_. " else "_" for c in code).strip(" .")
+    return f"{name}_" if DEVICE_NAME.match(name) else name or otherwise
 
 
 def printable_path(path: Path) -> str:
@@ -152,183 +174,130 @@ def _refusal(path: Path) -> str:
     return ""
 
 
-def _label_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> dict[Path, str]:
-    """Return the folders that are named like a gesture, and its label; ``labels`` are those in the names of files.
+@dataclass(frozen=True)
+class ScanSpec:
+    """What a scan needs, with the files read that an import names; see `importers.ScanSettings`.
 
-    A gesture is one of the set, or a label of any file. The authors' scripts move recordings into such folders, and
-    read the label from there.
+    ``mapping`` is from file to person; ``layout_origin`` describes the layout in messages; ``new_folder`` creates a
+    temporary folder for unpacked or converted files.
     """
-    known = set(map(plain_label, labels.values()))
-    found: dict[Path, str] = {}
-    for place in {path.parent for path in labels}:
-        name = place.resolve().name
-        gesture = gestures.find(name) if gestures is not None else None
-        if gesture is not None or plain_label(name) in known:
-            found[place] = name if gesture is None else gesture.label
-    return found
+
+    layout: Layout | None
+    gestures: GestureSet | None
+    mapping: Mapping[str, str] | None
+    new_folder: Callable[[str], Path]
+    layout_origin: str = "the given layout"
+    columns: Mapping[str, str] = field(default_factory=dict)
+    limits: UnpackLimits = field(default_factory=UnpackLimits)
+    person: str | None = None
+    guess_layout: bool = False
+    pattern: ImportPattern | None = None
+    streams: Path | None = None
+
+    def begin_scan(self, shape: str, files: Iterable[Path], own: Layout | None = None) -> SourceScan:
+        """Begin the scan of a source with the layout ``own``, else the given one, else that of the files."""
+        layout, notes = own or self.layout, list[str]()
+        if layout is None:
+            layout, note = find_layout(list(files), self.guess_layout)
+            notes.append(note)
+        gestures = self.gestures
+        if gestures is None and layout.name.startswith("plush"):
+            gestures = load_gestures("plush-18")
+        return SourceScan(layout, gestures, shape, notes=notes)
+
+    def mapped(self, relative: Path) -> str | None:
+        """Return the person whom the mapping names for a file, by its path below the source, or by its name."""
+        mapping = self.mapping or {}
+        return mapping.get(relative.as_posix(), mapping.get(relative.name))
 
 
-def _same_gesture(one: str, other: str, gestures: GestureSet | None) -> bool:
-    """Return whether two labels are of one gesture."""
-    if plain_label(one) == plain_label(other) or gestures is None:
-        return plain_label(one) == plain_label(other)
-    found = gestures.find(one)
-    return found is not None and found == gestures.find(other)
+def find_layout(files: Sequence[Path], guess: bool) -> tuple[Layout, Sentence]:
+    """Return the built-in layout of ``files``, and a note that says by what it was found.
 
-
-def _nobodys_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> set[Path]:
-    """Return the folders in which every recording is of a gesture without a person (the toy at rest)."""
-    with_nobody: set[Path] = set()
-    with_people: set[Path] = set()
-    for path, label in labels.items():
-        gesture = gestures.find(label) if gestures is not None else None
-        (with_nobody if gesture is not None and gesture.nobody else with_people).add(path.parent)
-    return with_nobody - with_people
-
-
-def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested: bool) -> None:
-    """Raise DatasetError if two folders have the same name, so that people are neither merged nor split.
-
-    With ``nested``, also raise it for a folder of recordings inside another one.
-    """
-    folders: dict[str, Path] = {}
-    for f in files:
-        if not f.kind or f.subject in (NOBODY, UNKNOWN_SUBJECT):
-            continue
-        other = folders.setdefault(f.subject.casefold(), f.source.parent)
-        if other != f.source.parent:
-            a, b = (p.relative_to(source).as_posix() for p in (other, f.source.parent))
-            raise DatasetError(
-                f"The person is not clear: '{a}' and '{b}' in '{source}' have the same name: {_ASK}.",
-                reason="person_twice",
-                a=a,
-                b=b,
-            )
-    places = set(folders.values())
-    for place in sorted(places) if nested else ():
-        above = next((p for p in place.parents if p in places), None)
-        if above is not None:
-            raise DatasetError(
-                f"The person is not clear: '{place}' lies in '{above}', and both hold recordings: {_ASK}.",
-                reason="person_nested",
-                a=place.name,
-                b=above.name,
-            )
-
-
-def _where(subjects: dict[str, str] | None) -> str:
-    """Return where the person of a file is looked for."""
-    return "in the folder of a person" if subjects is None else "named in the mapping file of --subjects"
-
-
-def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
-    """Return the person that ``subjects`` has for the path of a file below ``source``, or for its name."""
-    return subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
-
-
-def _folder_person(path: Path, source: Path, person: str | None) -> str | None:
-    """Return the person whose folder holds a file; directly in ``source`` it is ``person``, unless that is None."""
-    return path.parent.resolve().name if path.parent != source or person is None else person or None
-
-
-def classify_gesture_recorder(
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
-) -> Iterator[SourceFile]:
-    """Classify the files in the folders of the GestureRecorder.
-
-    ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
-    or nobody if all its recordings are of the toy at rest. A folder that is named like a gesture is no person: its
-    people are not known, and its label is that of all its recordings, as a label is corrected by moving the file.
-    ``person`` is as in `import_recordings`.
-    """
-    named = {path: name.label for path in files if (name := parse_name(path.name)) is not None}
-    label_folders = _label_folders(named, gestures)
-    labels = {path: label_folders.get(path.parent, label) for path, label in named.items()}
-    nobodys = _nobodys_folders(labels, gestures)
-    left_behind: set[Path] = set()
-    if label_folders.keys() - nobodys:
-        # Streams that the anonymising step has left behind belong to recordings that no longer name their person, and
-        # the folder of all gestures is no person either.
-        left_behind = {path.parent for path in files} - ({path.parent for path in named} - nobodys) | {source}
-    for path in files:
-        by_label = path.parent in label_folders or path.parent in left_behind
-        if subjects is not None:
-            # A mapping need not list recordings of the untouched toy.
-            subject = _mapped(path, source, subjects) or (NOBODY if path.parent in nobodys else None)
-        elif path.parent in nobodys:
-            subject = NOBODY
-        elif by_label:
-            subject = person or UNKNOWN_SUBJECT
-        else:
-            subject = _folder_person(path, source, person)
-        if path.name.casefold() == STREAM_NAME.casefold():
-            if (by_label and not person) or subject is None:
-                note = Sentence("a session stream whose person is not known", reason="person_unknown")
-                yield SourceFile(path, "", reason=note)
-            else:
-                yield SourceFile(path, STREAMS, subject)
-        elif parse_name(path.name) is None:
-            note = Sentence("not a recording: its name is not <label>_<epoch ms>_<rows>.csv", "file_no_recording")
-            yield SourceFile(path, "", reason=note)
-        elif subject is None:
-            yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
-        else:
-            moved = not _same_gesture(named[path], labels[path], gestures)
-            yield SourceFile(path, RECORDINGS, subject, gesture=labels[path] if moved else "")
-
-
-def classify_labelled_rows(
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
-) -> Iterator[SourceFile]:
-    """Classify CSVs with a label on every row: each file is a stream, and runs of equal labels are recordings."""
-    one_person = all(path.parent == source for path in files)
-    for path in files:
-        if subjects is not None:
-            subject = _mapped(path, source, subjects)
-        else:
-            subject = _folder_person(path, source, person) if one_person or path.parent != source else person or None
-        if path.suffix.lower() != ".csv":
-            yield SourceFile(path, "", reason=Sentence("not a CSV file", reason="file_no_recording"))
-        elif subject is None:
-            yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
-        else:
-            yield SourceFile(path, STREAMS, subject)
-
-
-CLASSIFIERS: dict[str, Callable[..., Iterator[SourceFile]]] = {
-    "gesture-recorder": classify_gesture_recorder,
-    "labelled-rows": classify_labelled_rows,
-}
-
-
-def classify_files(
-    shape: str,
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
-) -> list[SourceFile]:
-    """Classify regular files by the folder structure ``shape`` (a key of `CLASSIFIERS`); each is returned once.
+    Args:
+        guess: whether to take the most probable layout that can read the files if their header names none or several.
 
     Raises:
-        DatasetError: if the folders do not identify the people.
+        ConfigError: if there is none, or several fit.
     """
-    classified = list(CLASSIFIERS[shape](source, files, subjects, gestures, person))
-    if subjects is None:
-        # A person that was named may have recordings in several folders of gestures.
-        _refuse_unclear_people(
-            source, [f for f in classified if f.subject != person], nested=shape == "gesture-recorder"
-        )
-    return classified
+    found, why = _named_in_header(files), "the header of the files has its channels"
+    if not found and (found := _without_header(files)):
+        why = f"the files have its {len(found[0].csv.columns)} columns"
+    if len({layout.csv.columns for layout in found}) == 1 < len(found):
+        # They differ in the clock that the toy sends. Files without rows tell nothing, and are refused later.
+        found = (readable_layouts(files, [layout.name for layout in found]) or found[::-1])[:1]
+        why += f", the last one a {'clock' if DEVICE_MS in found[0].wire else 'delay'}"
+    elif guess and len(found) != 1:
+        found = readable_layouts(files, [layout.name for layout in found])[:1]
+    if len(found) == 1:
+        name = found[0].name
+        return found[0], Sentence(f"the layout is '{name}', as {why}", reason="layout_guessed", layout=name)
+    fit = f"The header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
+    raise ConfigError(
+        f"--layout is needed: accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
+        f"names the channels (see docs/importing.md). {fit}For files of another form, let --guess FILE.toml write "
+        "a pattern.",
+        reason="layout_unknown",
+    )
+
+
+def _named_in_header(files: Iterable[Path]) -> list[Layout]:
+    """Return the built-in layouts with most channels, all of which the header of the first fitting CSV file names."""
+    layouts = [load_layout(name) for name in layout_names()]
+    for path in files:
+        if path.suffix.lower() == ".csv":
+            with path.open(encoding="utf-8-sig", errors="replace") as file:
+                texts = {text.strip().strip('"').casefold() for text in re.split("[,;\t]", file.readline(4096))}
+            found = [
+                layout
+                for layout in layouts
+                for of in (dict(zip(layout.csv.columns, layout.csv.header, strict=True)),)
+                if all({name.casefold(), of.get(name, name).casefold()} & texts for name in layout.names)
+            ]
+            # A layout of an accelerometer also fits files that have more channels.
+            if found:
+                most = max(layout.n_channels for layout in found)
+                return [layout for layout in found if layout.n_channels == most]
+    return []
+
+
+def readable_layouts(files: Iterable[Path], names: Sequence[str] = ()) -> list[Layout]:
+    """Return the built-in layouts (or those in ``names``) that read the first CSV files, the most probable first.
+
+    Layouts that differ only in the firmware's clock read the same files; the files tell a clock from delays.
+    """
+    samples: list[tuple[Path, bytes]] = []
+    for path in files:
+        if path.suffix.lower() == ".csv" and len(samples) < _SAMPLED_FILES:
+            with path.open("rb") as file:
+                data = file.read(_SAMPLED_BYTES)
+            samples.append((path, data if len(data) < _SAMPLED_BYTES else data[: data.rfind(b"\n") + 1]))
+    ranked: list[tuple[int, int, str]] = []
+    for name in names or layout_names():
+        layout, read, delays = load_layout(name), 0, 0
+        for path, data in samples:
+            with contextlib.suppress(FileFormatError):
+                delays += read_recording(path, layout, data).integrated
+                read += 1
+        if read:
+            ranked.append((-read, (DEVICE_MS not in layout.wire) != (delays > 0), name))
+    return [load_layout(name) for _, _, name in sorted(ranked)]
+
+
+def _without_header(files: Iterable[Path]) -> list[Layout]:
+    """Return the built-in layouts that read the first recordings of the authors' recorder which have no header.
+
+    Their truncation script leaves such files. The column of the computer's time must hold times since 2001.
+    """
+    named = [path for path in files if parse_name(path.name) is not None][:_SAMPLED_FILES]
+
+    def reads(layout: Layout, path: Path) -> bool:
+        with contextlib.suppress(FileFormatError):
+            host = read_recording(path, layout).frames.host_ms
+            return host is not None and float(np.median(host)) > _SINCE_2001_MS
+        return False
+
+    return [layout for layout in map(load_layout, layout_names()) if named and all(reads(layout, f) for f in named)]
 
 
 MAPPING_COLUMNS = {
@@ -357,165 +326,3 @@ def read_mapping(path: Path) -> dict[str, str]:
         if mapping.setdefault(name, subject) != subject:
             raise DatasetError(f"The mapping file '{path}' gives '{name}' to '{mapping[name]}' and '{subject}'.")
     return mapping
-
-
-# Suffixes of files that the recorder leaves behind if it is killed, or is still running.
-_UNFINISHED = Sentence(
-    "not finished when the recorder stopped; its rows are in the session's stream", reason="file_unfinished"
-)
-LEFT_OVER = {
-    ".part": _UNFINISHED,
-    ".new": _UNFINISHED,
-    ".torn": Sentence(
-        "damaged by a crash and renamed by the recorder; its rows are in the session's stream", reason="file_unfinished"
-    ),
-    ".lock": Sentence("a lock of the recorder", reason="file_lock"),
-}
-
-Sessions = dict[Path, SessionHead | str]
-
-
-def read_sessions(files: Iterable[Path]) -> Sessions:
-    """Return for each session folder among ``files`` its head, or the reason why that cannot be used."""
-    sessions: Sessions = {}
-    for path in files:
-        if path.name != SESSION_HEAD:
-            continue
-        try:
-            head = SessionHead.read(path.parent)
-            if head is not None and head.subject.strip():
-                Layout.from_dict(head.layout, "layout")
-        except (BadInput, RecursionError) as cause:
-            message = f"its {SESSION_HEAD} cannot be used: {cause}"
-            sessions[path.parent] = Sentence(message, reason="session_unusable", file=SESSION_HEAD)
-            continue
-        if head is not None:
-            nobody = Sentence(f"its {SESSION_HEAD} names no subject", reason="person_unknown")
-            sessions[path.parent] = head if head.subject.strip() else nobody
-    return sessions
-
-
-def session_of(path: Path, sessions: Mapping[Path, object]) -> Path | None:
-    """Return the nearest session folder that contains a file; None if there is none."""
-    return next((place for place in path.parents if place in sessions), None)
-
-
-def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout | None:
-    """Return the layout that all sessions and ``given`` share; ``of`` describes ``given`` in messages.
-
-    Raises:
-        DatasetError: if two layouts differ, or sessions have a layout with a label on every row.
-    """
-    agreed = given
-    for place, head in sessions.items():
-        if isinstance(head, str):
-            continue
-        own = Layout.from_dict(head.layout, f"layout of the session '{place.name}'")
-        if agreed is None:
-            agreed, of = own, f"session '{place.name}'"
-        elif own.to_dict() != agreed.to_dict():
-            other = f"'{own.name}'" if own.name != agreed.name else f"another '{own.name}'"
-            raise DatasetError(
-                f"Session '{place.name}' was recorded with the layout {other}, but {of} is '{agreed.name}': "
-                "a data set has one layout, so import them apart.",
-                reason="sessions_differ",
-                session=place.name,
-                layout=own.name,
-                other=agreed.name,
-            )
-    if agreed is not None and agreed.is_labelled and any(isinstance(h, SessionHead) for h in sessions.values()):
-        raise DatasetError(
-            f"Layout '{agreed.name}' has a label on every row, unlike sessions: remove 'label' from its csv.columns."
-        )
-    return agreed
-
-
-def classify_session_files(sessions: Sessions, files: Iterable[Path]) -> Iterator[SourceFile]:
-    """Classify those of ``files`` that are in session folders."""
-    by_session: dict[Path, list[Path]] = {}
-    for path in files:
-        place = session_of(path, sessions)
-        if place is not None:
-            by_session.setdefault(place, []).append(path)
-    for place, mine in by_session.items():
-        head = sessions[place]
-        if isinstance(head, str):
-            yield from (SourceFile(path, "", reason=head) for path in mine)
-        else:
-            yield from _find(place, head, mine)
-
-
-def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceFile]:
-    try:
-        discarded = discarded_recordings(place)
-    except (BadInput, OverflowError, RecursionError) as cause:
-        # Without the log it is unknown which recordings were discarded.
-        note = Sentence(f"its {SESSION_LOG} cannot be used: {cause}", reason="session_unusable", file=SESSION_LOG)
-        yield from (SourceFile(path, "", reason=note) for path in files)
-        return
-    stream = place / STREAM_NAME
-    mains = {p.with_suffix("").as_posix(): p for p in files if p == stream or parse_name(p.name) is not None}
-    for path in files:
-        of_session = partial(SourceFile, path, subject=head.subject, session=head.session or place.name)
-        name = path.name
-        if path == stream:
-            yield of_session(STREAMS)
-        elif parse_name(name) is not None:
-            yield of_session(RECORDINGS, set_aside=discarded.get(name, ""))
-        elif path.parent == place and name in (SESSION_HEAD, SESSION_LOG):
-            yield of_session(COMPANIONS, beside=stream if stream in files else None)
-        elif path.suffix in LEFT_OVER:
-            yield of_session(LEFT_OUT, reason=LEFT_OVER[path.suffix])
-        elif name.endswith(SIDECAR):
-            main = mains.get(path.with_suffix("").as_posix())
-            if main is None:
-                note = Sentence("the sidecar of a recording that is missing", reason="file_orphan")
-                yield of_session(LEFT_OUT, reason=note)
-            else:
-                yield of_session(COMPANIONS, beside=main)
-        else:
-            note = Sentence(
-                "no file of a session: expected are recordings, sidecars, stream and log", reason="file_no_recording"
-            )
-            yield of_session("", reason=note)
-
-
-def moved_note(files: Iterable[SourceFile]) -> list[Sentence]:
-    """Return a note on recordings that get the label of their folder, and not that of their name."""
-    moved = [f for f in files if f.gesture]
-    if not moved:
-        return []
-    first = f"'{(moved[0].cut or moved[0].source).name}' in '{moved[0].gesture}'"
-    message = (
-        f"{plural(len(moved), 'recording')} in the folder of another gesture than the name says (the first: {first}): "
-        "the folder's label is taken by a mark, as the authors' scripts read the label from the folder"
-    )
-    return [Sentence(message, "moved_by_label", n=len(moved), file=first)]
-
-
-def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
-    """Return the people of the sessions, with the latest value of each field, and a note for each changed value."""
-    people: dict[str, PersonInfo] = {}
-    notes: list[str] = []
-    heads = sorted((h for h in sessions.values() if isinstance(h, SessionHead)), key=lambda h: h.started_ms)
-    for head in heads:
-        values = {key: _plain(getattr(head, key)) for key in ("age_group", "gender", "consent")}
-        before = people.get(head.subject)
-        for key, value in values.items() if before is not None else ():
-            earlier = getattr(before, key)
-            if earlier and value and earlier != value:
-                message = (
-                    f"the sessions of '{head.subject}' differ in {key.replace('_', ' ')} ('{earlier}', '{value}'): "
-                    "the latest is kept"
-                )
-                values_of = {"person": head.subject, "old": earlier, "new": value}
-                notes.append(Sentence(message, reason="person_changed", **values_of))
-            values[key] = value or earlier
-        people[head.subject] = PersonInfo(head.subject, values["age_group"], values["gender"], values["consent"])
-    return list(people.values()), notes
-
-
-def _plain(text: str) -> str:
-    """Return ``text`` as one printable line."""
-    text = text.encode("utf-8", "replace").decode("utf-8")
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

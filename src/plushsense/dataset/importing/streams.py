@@ -14,10 +14,10 @@ from plushsense.core.errors import DatasetError, FileFormatError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import STREAM_NAME, ReadResult, read_recording, read_stream
 from plushsense.core.sentences import join_names, plural
+from plushsense.dataset.importing.folders import classify_files
 from plushsense.dataset.importing.sources import (
     SourceFile,
     SourceScan,
-    classify_files,
     is_simulation,
     printable_path,
     source_files,
@@ -31,16 +31,16 @@ Stream = tuple[str, ReadResult, RowLookup]
 """Person, content and lookup of a stream."""
 
 
-def find_people(search: SourceScan, folder: Path) -> None:
-    """Give the recordings of ``search`` whose people are not known the people in whose streams they are.
+def find_people(scan: SourceScan, folder: Path) -> None:
+    """Give the recordings of ``scan`` whose people are not known the people in whose streams they are.
 
-    The streams in ``folder`` are added to the search, and notes on how many recordings were found.
+    The streams in ``folder`` are added to the scan, and notes on how many recordings were found.
 
     Args:
         folder: folders of people, each with its ``fulldatastream.csv``.
 
     Raises:
-        DatasetError: if ``folder`` has no stream, none of the recordings is in one, or ``search`` has no recording
+        DatasetError: if ``folder`` has no stream, none of the recordings is in one, or ``scan`` has no recording
             without a known person.
     """
     if not folder.is_dir():
@@ -50,11 +50,11 @@ def find_people(search: SourceScan, folder: Path) -> None:
     found = classify_files("gesture-recorder", folder, regular, None, None)
     if not found:
         raise DatasetError(f"'{folder}' has no {STREAM_NAME}: --streams names the folder of the people's folders.")
-    unknown = [f for f in search.found if f.kind == RECORDINGS and f.subject in (UNKNOWN_SUBJECT, NOBODY)]
+    unknown = [f for f in scan.found if f.kind == RECORDINGS and f.subject in (UNKNOWN_SUBJECT, NOBODY)]
     if not any(f.subject == UNKNOWN_SUBJECT for f in unknown):
         raise DatasetError("--streams is for recordings whose people are not known; the source has none: leave it out.")
-    streams = [s for f in found if (s := _read(f, search)) is not None]
-    people = {f.source: _people_of(f, streams, search) for f in unknown}
+    streams = [s for f in found if (s := _read(f, scan)) is not None]
+    people = {f.source: _people_of(f, streams, scan) for f in unknown}
     named = {path: mine[0] for path, mine in people.items() if len(mine) == 1}
     if not any(people.values()):
         raise DatasetError(
@@ -62,40 +62,38 @@ def find_people(search: SourceScan, folder: Path) -> None:
             "the people who made them, or leave it out."
         )
     theirs = {path.resolve() for path in regular}
-    search.found = [
-        replace(f, subject=named.get(f.source, f.subject)) for f in search.found if f.source.resolve() not in theirs
+    scan.found = [
+        replace(f, subject=named.get(f.source, f.subject)) for f in scan.found if f.source.resolve() not in theirs
     ]
-    search.found += [replace(f, origin=printable_path(f.source.relative_to(folder))) for f in found]
-    search.simulated = search.simulated or is_simulation(folder, files)
-    search.streams_named = True
+    scan.found += [replace(f, origin=printable_path(f.source.relative_to(folder))) for f in found]
+    scan.simulated = scan.simulated or is_simulation(folder, files)
+    scan.streams_named = True
     note = f"{len(named)} of {len(people)} recordings are found in the streams of '{folder.name}'"
     if named:
         note += ", and have their people from there: this undoes the anonymisation of the recordings"
-    search.notes.append(note)
+    scan.notes.append(note)
     lost = [f.origin for f in unknown if not people[f.source]]
     if lost:
-        search.notes.append(
-            f"in none of the streams, so without a person ({len(lost)}): {join_names(lost, most=_NAMED)}"
-        )
+        scan.notes.append(f"in none of the streams, so without a person ({len(lost)}): {join_names(lost, most=_NAMED)}")
     several = [f"{f.origin} ({join_names(mine)})" for f in unknown if len(mine := people[f.source]) > 1]
     if several:
         listed = join_names(several, most=_NAMED)
-        search.notes.append(f"in the streams of several people, so without a person ({len(several)}): {listed}")
+        scan.notes.append(f"in the streams of several people, so without a person ({len(several)}): {listed}")
 
 
-def _read(file: SourceFile, search: SourceScan) -> Stream | None:
+def _read(file: SourceFile, scan: SourceScan) -> Stream | None:
     """Read a stream; None if it cannot be read, which the import says when it reads the copy."""
     try:
-        read = read_stream(file.source, search.layout)
+        read = read_stream(file.source, scan.layout)
     except FileFormatError:
         return None
     return file.subject, read, RowLookup.of(read.frames)
 
 
-def _people_of(file: SourceFile, streams: Sequence[Stream], search: SourceScan) -> list[str]:
+def _people_of(file: SourceFile, streams: Sequence[Stream], scan: SourceScan) -> list[str]:
     """Return the people in whose streams most of a recording is; several if equally many of its rows are in each."""
     try:
-        recording = read_recording(file.source, search.layout)
+        recording = read_recording(file.source, scan.layout)
     except FileFormatError:
         return []
     rows: dict[str, int] = {}

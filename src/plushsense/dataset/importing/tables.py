@@ -18,7 +18,7 @@ import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -110,26 +110,34 @@ def usable_rows(*columns: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(np.all(np.abs(np.column_stack(columns)) < LARGEST, axis=1))
 
 
+@dataclass(frozen=True)
+class SessionTarget:
+    """A session to write: its new ``folder``, the codes of person and session, and the layout of its files."""
+
+    folder: Path
+    subject: str
+    session: str
+    layout: Layout
+
+
 def write_session(
-    folder: Path,
-    subject: str,
-    session: str,
+    target: SessionTarget,
+    original: ConvertedSource,
     frames: Frames,
     cuts: Sequence[LabelledSegment],
-    layout: Layout,
-    original: ConvertedSource,
     *,
     with_stream: bool,
     taken: set[str] | None = None,
 ) -> Iterator[SourceFile]:
-    """Write one session into the new ``folder``: recordings, with ``with_stream`` the stream, and ``origin.json``.
+    """Write one session: its recordings, with ``with_stream`` the stream, and ``origin.json``; yield the files.
 
-    For a layout with a label on every row, one labelled stream is written instead of recordings. Yields the files.
-    ``taken`` are names of recordings in other files of the session, to which the new ones are added; with it, no
-    ``origin.json`` is written.
+    For a layout with a label on every row, one labelled stream is written instead of recordings. ``taken`` are names of
+    recordings in other files of the session, to which the new ones are added; with it, no ``origin.json`` is written.
     """
+    folder, layout, session = target.folder, target.layout, target.session
+    file_of = partial(SourceFile, subject=target.subject, session=session)
     folder.mkdir(parents=True)
-    where = f"{original.display_name}: {subject}{f', session {session}' if session else ''}"
+    where = f"{original.display_name}: {target.subject}{f', session {session}' if session else ''}"
     main: Path | None = None
     if layout.is_labelled:
         separator = layout.csv.separator.strip() or " "
@@ -146,7 +154,7 @@ def write_session(
                 file.write(format_header(layout))
             for start in range(0, len(frames), 20_000):
                 file.write(format_rows(frames.slice(start, start + 20_000), layout))
-        yield SourceFile(main, STREAMS, subject, session=session, origin=f"{where}, the whole stream")
+        yield file_of(main, STREAMS, origin=f"{where}, the whole stream")
     names = set[str]() if taken is None else taken
     clock = frames.device_ms if frames.host_ms is None or HOST_MS not in layout.csv.columns else frames.host_ms
     for cut in cuts:
@@ -158,17 +166,17 @@ def write_session(
         names.add(path.name)
         if len(path.name.encode("utf-8")) > LONGEST_LABEL:
             note = Sentence("its label is too long for a file name", reason="label_too_long")
-            yield SourceFile(path, "", origin=name, reason=note)
+            yield file_of(path, "", origin=name, reason=note)
             continue
         # Nothing is lost if these temporary files are: they need not be on the disk before the import copies them.
         rows = format_rows(frames.slice(cut.start, cut.stop), layout)
         path.write_text(format_header(layout) + rows, encoding="utf-8", newline="\n")
-        yield SourceFile(path, RECORDINGS, subject, session=session, origin=name)
+        yield file_of(path, RECORDINGS, origin=name)
     if taken is not None:
         return
     about = folder / ORIGIN
     about.write_text(_json(original.table), encoding="utf-8", newline="\n")
-    yield SourceFile(about, COMPANIONS, subject, session=session, origin=f"{where}, {ORIGIN}", beside=main)
+    yield file_of(about, COMPANIONS, origin=f"{where}, {ORIGIN}", beside=main)
 
 
 def about_file(name: str, note: str) -> Sentence:
@@ -365,11 +373,9 @@ class TableImport:
         yield from self._short(table.display_name, [samples.row[mine[c.start : c.stop]] for c in cuts])
         key = samples.people[samples.person[mine[0]]], samples.sessions[samples.session[mine[0]]]
         taken = None if table.place is None else self._taken.setdefault(key, set())
-        folder = self.folder / str(self._written)
+        target = SessionTarget(self.folder / str(self._written), *key, self.layout)
         self._written += 1
-        files = list(
-            write_session(folder, *key, frames, cuts, self.layout, original, with_stream=with_stream, taken=taken)
-        )
+        files = list(write_session(target, original, frames, cuts, with_stream=with_stream, taken=taken))
         yield from files
         yield from self._merged(table.display_name, sorted({cut.label for cut in cuts}))
         if taken is not None:

@@ -24,6 +24,7 @@ _BACKUP = re.compile(r"training data - backup \d{4}-\d\d-\d\d_\d{6}", re.IGNOREC
 # The person who chose is not in the files.
 IMPORTER = "plushsense import"
 CHOSEN = Sentence("no recording: its choices become marks of the recordings", "choices_read")
+REPLACED = Sentence("cut by the truncation script: its uncut original is imported, and the cut is a mark", "cut_copy")
 _COLUMNS = ("filename", "fullpath", "length", "truncaten")
 
 
@@ -42,49 +43,78 @@ class Choice:
 
 
 @dataclass
-class Backups:
-    """What backup folders mean for the files of a source.
+class Truncation:
+    """What the truncation script has left in a source.
 
     Attributes:
-        kept: the files to import; a cut recording stands for its original.
+        files: the files to import; a cut recording stands for its original.
         originals: the uncut original to import in place of each cut recording.
-        left_out: why other files in backup folders are not imported.
-        choices: how many rows the script has cut off, for each original.
+        left_out: why other files of the script are not imported.
+        refused: why files of choices cannot be read.
+        choices: how many rows the script has cut off, or the user has chosen to.
+        notes: a note if the file of choices beside the source cannot be read.
     """
 
-    kept: list[Path]
+    files: list[Path]
     originals: dict[Path, Path] = field(default_factory=dict)
     left_out: dict[Path, Sentence] = field(default_factory=dict)
+    refused: dict[Path, Sentence] = field(default_factory=dict)
     choices: list[Choice] = field(default_factory=list)
+    notes: list[Sentence] = field(default_factory=list)
 
-    @classmethod
-    def among(cls, source: Path, files: Iterable[Path]) -> Backups:
-        """Match the recordings in backup folders below ``source`` with the cut ones among ``files``, by name.
+    def match_backups(self, source: Path) -> None:
+        """Match the recordings in backup folders below ``source`` with the cut ones, by name.
 
         Of several backups of a recording, the oldest is its original. One without a cut recording is kept as it is.
         """
-        files = list(files)
-        folders = {path: folder for path in files if (folder := _backup_of(path, source))}
-        found = cls([path for path in files if path not in folders])
+        folders = {path: folder for path in self.files if (folder := _backup_of(path, source))}
+        self.files = [path for path in self.files if path not in folders]
         present: dict[str, list[Path]] = {}
-        for path in found.kept:
+        for path in self.files:
             if parse_name(path.name):
                 present.setdefault(path.name.casefold(), []).append(path)
         for path in sorted(folders, key=lambda p: (folders[p], p)):
             named = present.get(path.name.casefold(), [])
             cut = next((p for p in named if p.parent.name == path.parent.name), named[0] if named else None)
             if cut is None:
-                found.kept.append(path)
+                self.files.append(path)
                 if parse_name(path.name):
                     present[path.name.casefold()] = [path]
-            elif cut in folders or cut in found.originals or (counts := _rows_before(cut, path)) is None:
-                found.left_out[path] = _copy_of(folders[path])
+            elif cut in folders or cut in self.originals or (counts := _rows_before(cut, path)) is None:
+                message = f"a copy, in '{folders[path]}', of a recording that is imported"
+                self.left_out[path] = Sentence(message, "backup_copy", folder=folders[path])
             else:
-                found.originals[cut] = path
+                self.originals[cut] = path
                 where = f"the cut copy in '{cut.parent.name}'"
-                found.choices.append(Choice(path.name, path.parent.name, counts[0], counts[1], where))
-        found.kept.sort()
-        return found
+                self.choices.append(Choice(path.name, path.parent.name, counts[0], counts[1], where))
+        self.files.sort()
+        self.left_out |= dict.fromkeys(self.originals, REPLACED)
+
+    def add_choices(self, source: Path) -> None:
+        """Read the choices in ``source``, or beside it, where the script writes them; a backup overrides them."""
+        inside = [f for f in self.files if f.name.casefold() == CHOICES]
+        beside = source.resolve().parent / CHOICES
+        restored, read = {choice.name.casefold() for choice in self.choices}, list[Choice]()
+        for path in inside or ([beside] if beside.is_file() else []):
+            try:
+                read += read_choices(path)
+            except DatasetError as cause:
+                if inside:
+                    self.refused[path] = Sentence.of(cause)
+                else:
+                    message = f"no trims are taken from the file beside the folder: {cause}"
+                    self.notes.append(Sentence(message, "choices_unread", file=path.name))
+        self.choices = [choice for choice in read if choice.name.casefold() not in restored] + self.choices
+        self.left_out |= {path: CHOSEN for path in inside if path not in self.refused}
+        self.files = [path for path in self.files if path not in inside]
+
+
+def find_truncation(source: Path, files: Iterable[Path]) -> Truncation:
+    """Return what the truncation script has left among the ``files`` of a source."""
+    found = Truncation(list(files))
+    found.match_backups(source)
+    found.add_choices(source)
+    return found
 
 
 def _backup_of(path: Path, source: Path) -> str:
@@ -196,35 +226,3 @@ def _notes(results: Mapping[str, int]) -> Iterator[str]:
     if results:
         parts = "; ".join(f"{count} {result}" for result, count in results.items())
         yield f"cuts of the truncation script, how many rows to cut off at the beginning: {parts}"
-
-
-def _copy_of(backup: str) -> Sentence:
-    """Return why a recording in the folder ``backup`` is left out."""
-    return Sentence(f"a copy, in '{backup}', of a recording that is imported", "backup_copy", folder=backup)
-
-
-REPLACED = Sentence("cut by the truncation script: its uncut original is imported, and the cut is a mark", "cut_copy")
-
-
-def choices_of(source: Path, files: Iterable[Path]) -> tuple[list[Choice], dict[Path, Sentence | None], list[Sentence]]:
-    """Read the choices of the truncation script in ``source``, or beside it, where the script writes them.
-
-    Returns:
-        The choices; for each such file in ``source`` why it cannot be read, None if it can; a note if the one beside
-        ``source`` cannot be read.
-    """
-    inside = [f for f in files if f.name.casefold() == CHOICES]
-    beside = source.resolve().parent / CHOICES
-    choices: list[Choice] = []
-    read: dict[Path, Sentence | None] = dict.fromkeys(inside)
-    notes: list[Sentence] = []
-    for path in inside or ([beside] if beside.is_file() else []):
-        try:
-            choices += read_choices(path)
-        except DatasetError as cause:
-            if path in read:
-                read[path] = Sentence.of(cause)
-            else:
-                message = f"no trims are taken from the file beside the folder: {cause}"
-                notes.append(Sentence(message, "choices_unread", file=path.name))
-    return choices, read, notes

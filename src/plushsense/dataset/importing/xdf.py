@@ -10,7 +10,6 @@ from __future__ import annotations
 import gzip
 import io
 import logging
-import os
 import re
 import shlex
 import struct
@@ -31,8 +30,15 @@ from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.markers import Marker, MarkerCuts, cut_by_markers, read_marker
 from plushsense.dataset.importing.pattern import MARKERS_ROLE, STREAM_ROLE
-from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile
-from plushsense.dataset.importing.tables import ConvertedSource, about_file, usable_rows, whole_steps, write_session
+from plushsense.dataset.importing.sources import LEFT_OUT, ScanSpec, SourceFile, SourceScan
+from plushsense.dataset.importing.tables import (
+    ConvertedSource,
+    SessionTarget,
+    about_file,
+    usable_rows,
+    whole_steps,
+    write_session,
+)
 from plushsense.devices.lsl import MARK, MARKERS
 
 ENDINGS = (".xdf", ".xdfz", ".xdf.gz")
@@ -199,27 +205,12 @@ def _sample_bytes(header: bytes) -> int:
     return 1 + int(count[1]) * size
 
 
-class _FirstBytes(io.FileIO):
-    """File that ends after its first ``length`` bytes."""
-
-    def __init__(self, path: Path, length: int):
-        super().__init__(path)
-        self._length = length
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        if whence == os.SEEK_END:
-            offset, whence = offset + self._length, os.SEEK_SET
-        return super().seek(offset, whence)
-
-    def readinto(self, buffer: Any) -> int:
-        left = max(0, self._length - self.tell())
-        return super().readinto(memoryview(buffer)[:left]) or 0
-
-
 def _load(path: Path, length: int, name: str) -> list[XdfStream]:
     pyxdf = need("pyxdf", extra="lsl")
     logging.getLogger("pyxdf").addHandler(logging.NullHandler())
-    with io.BufferedReader(_FirstBytes(path, length)) as file, np.errstate(all="ignore"):
+    with path.open("rb") as whole:
+        file = io.BytesIO(whole.read(length))
+    with np.errstate(all="ignore"):
         try:
             # Keep the original time stamps, since dejittering would hide jitter and lost samples.
             streams, _ = pyxdf.load_xdf(file, dejitter_timestamps=False)
@@ -433,18 +424,31 @@ def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Sentence]:
         yield Sentence(message, reason="xdf_no_gesture")
 
 
+def convert_xdf(path: Path, name: str, person: str | None, spec: ScanSpec, scan: SourceScan) -> tuple[str, str]:
+    """Convert an XDF file, and add its recordings and notes to ``scan``; return the person and the session."""
+    subject, session = person_and_session(path, person)
+    if spec.mapping is not None:
+        subject = person
+    if subject is None:
+        raise FileFormatError(
+            f"the person of '{name}' is not known: name the person with --subjects map.csv (file,subject), or call "
+            "the file sub-<code>_ses-<session>.xdf as LabRecorder does",
+            reason="person_unknown",
+        )
+    target = SessionTarget(spec.new_folder("converted"), subject, session, scan.layout)
+    scan.add(read_xdf(path, name, target, scan.gestures, spec.columns, spec.limits))
+    return subject, session
+
+
 def read_xdf(
     path: Path,
     display_name: str,
-    folder: Path,
-    subject: str,
-    session: str,
-    layout: Layout,
+    target: SessionTarget,
     gestures: GestureSet | None,
     choices: Mapping[str, str],
     limits: UnpackLimits,
 ) -> Iterator[SourceFile | str]:
-    """Write the recordings of an XDF file into the new ``folder``; yield the files, and warnings as text.
+    """Write the recordings of an XDF file into the new folder of ``target``; yield the files, and warnings as text.
 
     Args:
         choices: the name, or # and the number, of the ``stream`` of the toy and of that of the ``markers``, and the
@@ -455,6 +459,7 @@ def read_xdf(
         FileFormatError: for a damaged file, or if not exactly one stream matches.
         MissingExtraError: without pyxdf.
     """
+    layout, folder = target.layout, target.folder
     accepted = (STREAM_ROLE, MARKERS_ROLE, DEVICE_MS, *layout.names)
     for role in set(choices) - set(accepted):
         raise ConfigError(f"--column {role}=…: in an XDF file, accepted are {', '.join(accepted)}.")
@@ -476,9 +481,8 @@ def read_xdf(
         raise FileFormatError(message, reason="rows_unusable", n=layout.n_channels)
     about = {"stream": toy.stream.name, "type": toy.stream.type, "nominal_rate_hz": toy.stream.rate}
     original = ConvertedSource(path, display_name, about)
-    yield from write_session(
-        folder / "session", subject, session, frames, cuts.segments, layout, original, with_stream=True
-    )
+    inner = replace(target, folder=folder / "session")
+    yield from write_session(inner, original, frames, cuts.segments, with_stream=True)
     for stream in streams:
         if reason := (toy.others | others).get(stream.number):
             yield SourceFile(path, LEFT_OUT, origin=f"{display_name}: stream '{stream.name}'", reason=reason)

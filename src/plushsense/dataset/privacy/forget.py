@@ -39,15 +39,15 @@ from plushsense.dataset.files import (
     EVALUATIONS,
     INDEX,
     DatasetFile,
+    IndexStamp,
     accept_marks,
     list_files,
     match_code,
-    missing_files,
     person_folders,
 )
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, adding_locked, locked
-from plushsense.dataset.privacy.redaction import NamePatterns, is_searchable, texts_in, words_of_rows
+from plushsense.dataset.privacy.searching import NamePatterns, is_searchable, texts_in, words_of_rows
 from plushsense.dataset.store import (
     FORGOTTEN,
     HEAD,
@@ -109,10 +109,6 @@ class RemovalPlan:
     running: tuple[str, ...] = ()
     absent: bool = False
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self).items()}
-
 
 def read_removals(folder: Path) -> list[RemovalRecord]:
     """Return the records of earlier removals from a data set; they do not identify people."""
@@ -143,15 +139,8 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     """
     folder = Path(dataset)
     DatasetHead.read(folder)
-    if not subject.strip():
-        message = "No person was named: give the code of one, as  plushsense info  shows it."
-        raise DatasetError(message, reason="forget_nobody")
+    _refuse_nobody(subject)
     table = read_people(folder)
-    if subject in (NOBODY, UNKNOWN_SUBJECT):
-        raise DatasetError(
-            f"'{subject}' is no person, but the folder of recordings without one: exclude such recordings by a mark.",
-            reason="forget_nobody",
-        )
     files = list_files(folder)
     own = [f for f in files if f.person == subject]
     about = [line for line in _mark_lines(folder) if _is_about(line, subject)]
@@ -169,23 +158,9 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     evaluations = sorted((folder / EVALUATIONS).iterdir()) if (folder / EVALUATIONS).is_dir() else []
     # Files may have been deleted by hand, and results kept.
     if absent and not any(subject in _people_of(e) for e in evaluations):
-        known = people_of_dataset(folder)
-        # Codes of removed people are not stored, so an unknown code may be one of them, but not another spelling.
-        if not _record_lines(folder) or match_code(subject, known):
-            raise DatasetError(
-                f"'{folder}' knows no person '{subject}': it knows {', '.join(known) or 'nobody'}."
-                f"{nearest(subject, known)}",
-                reason="forget_unknown",
-            )
-    lost = [f for f in missing_files(folder) if PurePosixPath(f).parts[1] != subject]
-    if intent is None and lost and not absent:
-        raise DatasetError(
-            f"'{folder}' lacks {len(lost)} raw file{'s' if len(lost) > 1 else ''} of other people ('{lost[0]}'): "
-            "restore them first, since the removal deletes the list that they are missing from.",
-            reason="forget_missing",
-            n=len(lost),
-            file=lost[0],
-        )
+        _refuse_unknown(folder, subject)
+    if intent is None and not absent:
+        _refuse_missing(folder, subject)
     leftovers, running = _leftovers(folder, files)
     # Assume that a folder that does not state its people used the person.
     used = tuple(f"{EVALUATIONS}/{e.name}" for e in evaluations if subject in (_people_of(e) or (subject,)))
@@ -205,6 +180,48 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
         running,
         absent,
     )
+
+
+def _refuse_nobody(subject: str) -> None:
+    if not subject.strip():
+        message = "No person was named: give the code of one, as  plushsense info  shows it."
+        raise DatasetError(message, reason="forget_nobody")
+    if subject in (NOBODY, UNKNOWN_SUBJECT):
+        raise DatasetError(
+            f"'{subject}' is no person, but the folder of recordings without one: exclude such recordings by a mark.",
+            reason="forget_nobody",
+        )
+
+
+def _refuse_unknown(folder: Path, subject: str) -> None:
+    """Raise DatasetError for a code that nothing contains, unless it may be that of a person removed before."""
+    known = people_of_dataset(folder)
+    # Codes of removed people are not stored, so an unknown code may be one of them, but not another spelling.
+    if not _record_lines(folder) or match_code(subject, known):
+        raise DatasetError(
+            f"'{folder}' knows no person '{subject}': it knows {', '.join(known) or 'nobody'}."
+            f"{nearest(subject, known)}",
+            reason="forget_unknown",
+        )
+
+
+def _refuse_missing(folder: Path, subject: str) -> None:
+    """Raise DatasetError if raw files of other people are missing."""
+    lost = [f for f in _missing_files(folder) if PurePosixPath(f).parts[1] != subject]
+    if lost:
+        raise DatasetError(
+            f"'{folder}' lacks {len(lost)} raw file{'s' if len(lost) > 1 else ''} of other people ('{lost[0]}'): "
+            "restore them first, since the removal deletes the list that they are missing from.",
+            reason="forget_missing",
+            n=len(lost),
+            file=lost[0],
+        )
+
+
+def _missing_files(folder: Path) -> list[str]:
+    """Return the raw files that the index lists and that no longer exist."""
+    stamp = IndexStamp.read(folder)
+    return [] if stamp is None else stamp.missing(folder)
 
 
 def _mentions(folder: Path, files: Iterable[DatasetFile], subject: str, removed: tuple[str, ...]) -> Iterator[str]:
@@ -252,7 +269,7 @@ def _holds(text: str, subject: str) -> bool:
     for that. Codes such as ``7`` also are numbers, so they must be a line, a cell, a quoted text or a folder.
     """
     if is_searchable(subject):
-        found = bool(NamePatterns({subject: ""}).find_in(text)) or subject in text.splitlines()
+        found = bool(NamePatterns([subject]).find_in(text)) or subject in text.splitlines()
         return found or (len(subject) >= _LONG_CODE and subject in text)
     return re.search(_SHORT.format(re.escape(subject)), text, re.MULTILINE) is not None
 
@@ -334,7 +351,7 @@ def _remove_derived(folder: Path, plan: RemovalPlan) -> None:
         part.unlink()
     # Remove the index before the files it lists. For an absent person it stays if it is the only record of other
     # people's missing files.
-    owners = {PurePosixPath(f).parts[1] for f in missing_files(folder)}
+    owners = {PurePosixPath(f).parts[1] for f in _missing_files(folder)}
     if not plan.absent or owners == {plan.subject}:
         for name in reversed(INDEX):
             (folder / name).unlink(missing_ok=True)
@@ -398,7 +415,7 @@ def _is_about(line: bytes, subject: str) -> bool:
     table = _parsed(line)
     if table is None:
         text = line.decode("utf-8", "replace")
-        return f'"{subject}/' in text or bool(NamePatterns({subject: ""}).find_in(text))
+        return f'"{subject}/' in text or bool(NamePatterns([subject]).find_in(text))
     identity = table.get("recording") if isinstance(table, dict) else None
     return isinstance(identity, str) and (identity == subject or identity.startswith(f"{subject}/"))
 

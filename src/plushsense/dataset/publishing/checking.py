@@ -77,12 +77,22 @@ class Problem:
         return f"{self.validator}: {f'{self.file}: ' if self.file else ''}{self.problem}"
 
 
+@dataclass(frozen=True)
+class ValidatorResult:
+    """What a validator examined, the number of its problems, and its duration in s."""
+
+    validator: str
+    looked_at: str
+    problems: int
+    seconds: float
+
+
 @dataclass
 class ValidationResult:
-    """Result of all validators; ``validators`` lists what each of them examined, and its duration."""
+    """Result of all validators."""
 
     problems: list[Problem] = field(default_factory=list)
-    validators: list[dict[str, Any]] = field(default_factory=list)
+    validators: list[ValidatorResult] = field(default_factory=list)
 
     @property
     def valid(self) -> bool:
@@ -91,7 +101,8 @@ class ValidationResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {"valid": self.valid, "validators": self.validators, "problems": [vars(p) for p in self.problems]}
+        validators, problems = ([vars(each) for each in listed] for listed in (self.validators, self.problems))
+        return {"valid": self.valid, "validators": validators, "problems": problems}
 
 
 @dataclass
@@ -175,14 +186,8 @@ def check_folder(
         except Exception as cause:  # noqa: BLE001, RUF100
             package.report("", f"the validator gave up: {type(cause).__name__}: {_short(cause)}")
         checked.problems += [Problem(name, file, problem) for file, problem in package.problems]
-        checked.validators.append(
-            {
-                "validator": name,
-                "looked_at": package.looked_at,
-                "problems": len(package.problems),
-                "seconds": round(time.perf_counter() - began, 2),
-            }
-        )
+        seconds = round(time.perf_counter() - began, 2)
+        checked.validators.append(ValidatorResult(name, package.looked_at, len(package.problems), seconds))
     progress("validating", len(VALIDATORS), len(VALIDATORS))
     return checked
 
@@ -328,7 +333,7 @@ def _croissant(p: PackageView) -> None:
     issues = loaded.metadata.ctx.issues
     for issue in sorted({*issues.errors, *issues.warnings}, key=str):
         p.report(CROISSANT_FILE, str(issue))
-    records = compare_records(loaded, p.root, p.built.dataset, None if p.thorough else STREAM_ROWS, p.report)
+    records = compare_records(loaded, p.root, None if p.thorough else STREAM_ROWS, p.report)
     p.looked_at = ", ".join(f"{n} records of {name}" for name, n in records.items())
 
 

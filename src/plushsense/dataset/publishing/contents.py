@@ -2,14 +2,13 @@
 
 Raw files are rewritten with the layout's column keys, one separator and shifted times; sidecars, header notes and
 malformed lines are not included. Sessions are numbered, since their names may be dates. Marks are written without their
-author, reason and time.
+author, reason and time. On request, people get new codes (`keys`).
 """
 
 from __future__ import annotations
 
 import hmac
-import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -31,8 +30,11 @@ from plushsense.core.recorder_csv import (
     recording_filename,
 )
 from plushsense.core.sentences import Sentence
+from plushsense.dataset.files import walk_files
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
 from plushsense.dataset.marks import MARKS, PRACTICE, Mark, MarkState, mark_line, read_marks
+from plushsense.dataset.privacy.searching import NamePatterns, words_of_rows
+from plushsense.dataset.publishing.keys import KEPT, PublicationKey
 from plushsense.dataset.publishing.texts import is_misread, label_prefix, public_label
 from plushsense.dataset.store import (
     HEAD,
@@ -110,13 +112,22 @@ PUBLIC_COLUMNS = ("age_group", "gender")
 
 
 @dataclass(frozen=True)
-class PublishOptions:
-    """What to include (streams, excluded recordings, ``columns`` of the people's table), and the key of the shifts."""
+class ContentsSpec:
+    """What to publish of a data set.
+
+    Attributes:
+        streams: whether to include the streams of whole sessions.
+        excluded: whether to include excluded recordings, marked as such.
+        columns: columns of the people's table besides `PUBLIC_COLUMNS`.
+        key: the key of the time shifts and, with ``pseudonyms``, of the new codes; a new one by default.
+        pseudonyms: whether people get the codes of ``key`` instead of their own.
+    """
 
     streams: bool = True
     excluded: bool = False
     columns: tuple[str, ...] = ()
-    key: bytes = field(default_factory=lambda: secrets.token_bytes(32), repr=False)
+    key: PublicationKey = field(default_factory=PublicationKey)
+    pseudonyms: bool = False
 
 
 @dataclass(frozen=True)
@@ -137,33 +148,38 @@ class ContentsWriter:
     """
 
     def __init__(
-        self, dataset: Dataset, folder: Path, head: DatasetHead, options: PublishOptions, progress: Progress
+        self, dataset: Dataset, folder: Path, head: DatasetHead, spec: ContentsSpec, progress: Progress
     ) -> None:
         self.source = dataset
         self.folder = folder
-        self.options = options
+        self.spec = spec
         self.progress = progress
         self.labelled = dataset.layout.is_labelled
         self.notes: list[Sentence] = []
-        if self.labelled and not options.streams:
+        if self.labelled and not spec.streams:
             raise DatasetError(
                 f"'{dataset.path}' holds its recordings as parts of streams: it cannot be published without streams.",
                 reason="streams_needed",
             )
-        self.kept = [r for r in dataset.recordings if options.excluded or self.labelled or not r.excluded]
+        codes = public_codes(dataset, spec)
+        self.kept = [r for r in dataset.recordings if spec.excluded or self.labelled or not r.excluded]
+        self.streams = list(dataset.streams) if spec.streams else []
+        if spec.pseudonyms:
+            # In the order of the new codes, so that neither marks nor times of files reveal the old order.
+            self.kept.sort(key=lambda r: codes[_folder_of(r.file)])
+            self.streams.sort(key=lambda s: codes[_folder_of(s.file)])
         if not self.kept:
             raise DatasetError(
                 f"'{dataset.path}' has no recording left to publish: every one is excluded.",
                 reason="nothing_to_publish",
             )
-        self.streams = dataset.streams if options.streams else []
         clocks = (HOST_MS, DEVICE_MS) if self._all_have_host() else (DEVICE_MS,)
         columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
         self.layout = replace(dataset.layout, csv=CsvFormat(columns, columns, ","))
         self.label = public_labels(dataset)
         self.head = replace(head, layout=self.layout, gestures=self._gestures(), source="")
         folders = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
-        self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in folders}
+        self.codes = {folder: public for folder, public in codes.items() if folder in folders}
         self.shifts = self._shifts()
         self.sessions = self._sessions()
         self.taken: set[str] = set()
@@ -320,7 +336,7 @@ class ContentsWriter:
                 frames = read_stream(self.source.path / stream.file, self.source.layout).frames
                 firsts.append(int((frames.device_ms if frames.host_ms is None else frames.host_ms)[0]))
                 clocks.append(int(frames.device_ms[0]))
-            shifts[code] = shift_of(code, firsts, max(clocks, default=0) >= WALL_CLOCK_MS, self.options.key)
+            shifts[code] = shift_of(code, firsts, max(clocks, default=0) >= WALL_CLOCK_MS, self.spec.key.secret)
         return shifts
 
     def _sessions(self) -> dict[str, dict[str, int]]:
@@ -339,7 +355,7 @@ class ContentsWriter:
     def _write_people(self) -> dict[str, PersonInfo]:
         known = read_people(self.source.path)
         columns = {c for p in known.values() for c in p.more}
-        for column in self.options.columns:
+        for column in self.spec.columns:
             if column not in columns:
                 raise DatasetError(
                     f"{PEOPLE} has no column '{column}' to publish; besides {', '.join(PUBLIC_COLUMNS)} it has "
@@ -348,13 +364,13 @@ class ContentsWriter:
                     column=column,
                 )
         people = {
-            public: PersonInfo(public, p.age_group, p.gender, "", {c: p.more.get(c, "") for c in self.options.columns})
+            public: PersonInfo(public, p.age_group, p.gender, "", {c: p.more.get(c, "") for c in self.spec.columns})
             for code, public in self.codes.items()
             if (p := known.get(code)) is not None
         }
         if people:
             write_people(self.folder, people.values())
-        left_out = len(columns - set(self.options.columns)) + any(p.consent for p in known.values())
+        left_out = len(columns - set(self.spec.columns)) + any(p.consent for p in known.values())
         if left_out:
             # Give only the number, since even the name of a column may be private.
             message = f"Left out: {_count(left_out, 'column')} of the people's table."
@@ -386,7 +402,7 @@ class ContentsWriter:
 
     def _note_changes(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
         out = [r for r in self.source.recordings if r.excluded]
-        if out and not self.options.excluded and not self.labelled:
+        if out and not self.spec.excluded and not self.labelled:
             message = f"Left out: {_count(len(out), 'excluded recording')}."
             message += " Their rows are still in the session's stream." if self.streams else ""
             self.notes.append(
@@ -412,7 +428,7 @@ class ContentsWriter:
             )
             self.notes.append(Sentence(message, "relabelled", n=relabelled))
         renamed = [code for code, public in self.codes.items() if code != public]
-        if renamed:
+        if renamed and not self.spec.pseudonyms:
             message = (
                 f"Renamed: {_count(len(renamed), 'subject code')} that looked like a number or nothing, now with "
                 "a P in front."
@@ -439,19 +455,56 @@ def _folder_of(file: str) -> str:
     return Path(file).parts[1]
 
 
-def public_codes(dataset: Dataset) -> dict[str, str]:
-    """Return the public code of each person's folder; P is prepended to those that look like a number or no value."""
-    folders = {_folder_of(r.file) for r in dataset.recordings} | {_folder_of(s.file) for s in dataset.streams}
+def public_codes(dataset: Dataset, spec: ContentsSpec | None = None) -> dict[str, str]:
+    """Return the public code of each person's folder.
+
+    With pseudonyms it is that of the key; else P is prepended to those that look like a number or no value.
+    """
+    folders = person_codes(dataset)
+    if spec is not None and spec.pseudonyms:
+        return {folder: spec.key.codes.get(folder, folder) for folder in folders}
     fine = {f for f in folders if f == NOBODY or not is_misread(f)}
     codes: dict[str, str] = {}
     taken = {f.casefold() for f in fine}
-    for folder in sorted(folders):
+    for folder in folders:
         public = folder
         while folder not in fine and (public == folder or public.casefold() in taken):
             public = f"P{public}"
         taken.add(public.casefold())
         codes[folder] = public
     return codes
+
+
+def person_codes(dataset: Dataset) -> list[str]:
+    """Return the folders of the recordings and streams, sorted: codes of people, and those without a person."""
+    return sorted({_folder_of(r.file) for r in dataset.recordings} | {_folder_of(s.file) for s in dataset.streams})
+
+
+def refuse_traces(folder: Path, codes: Iterable[str]) -> None:
+    """Search names and texts of all files in ``folder`` for the original codes of people.
+
+    Codes that are too short to be told from other words are not found.
+
+    Raises:
+        DatasetError: if one is there.
+    """
+    originals = set(codes) - set(KEPT)
+    names = NamePatterns(originals)
+    for path in walk_files(folder):
+        file = path.relative_to(folder).as_posix()
+        for found in (*(originals & set(file.split("/"))), *names.find_in(f"{file}\n{_text_of(path)}")):
+            raise DatasetError(
+                f"'{file}' would still hold '{found}': nothing was written. If that is a gesture or another word of "
+                "the data, rename the person or the gesture, or change the text in dataset.toml first.",
+                reason="name_remains",
+                file=file,
+                name=found,
+            )
+
+
+def _text_of(path: Path) -> str:
+    data = path.read_bytes()
+    return words_of_rows(data) if path.suffix == ".csv" else data.decode("utf-8", "replace")
 
 
 def public_labels(dataset: Dataset) -> Callable[[str], str]:

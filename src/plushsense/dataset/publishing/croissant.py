@@ -1,6 +1,6 @@
 """Create the Croissant metadata of a package (``croissant.json``), and compare what mlcroissant loads with the files.
 
-Each loaded value of a table is compared with its text, each row of a recording or stream with what PlushSense reads.
+Each loaded value is compared with its text in the CSV file.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.layouts import DEVICE_MS, HOST_MS
-from plushsense.core.recorder_csv import Frames, read_stream
 from plushsense.dataset.publishing.description import (
     DATA,
     INTEGER,
@@ -29,7 +27,7 @@ from plushsense.dataset.publishing.description import (
     PackageTable,
     TableColumn,
 )
-from plushsense.dataset.store import Dataset
+from plushsense.dataset.store import RECORDINGS, STREAMS
 
 CROISSANT_FILE = "croissant.json"
 CONTEXT = "croissant_context.json"
@@ -131,70 +129,84 @@ def _field(table: PackageTable, column: TableColumn, extract: dict[str, str] | N
 ReportProblem = Callable[[str, str], None]
 
 
-def compare_records(
-    loaded: Any, root: Path, dataset: Dataset, stream_rows: int | None, report: ReportProblem
-) -> dict[str, int]:
-    """Load every record set, compare it with the files, and return the number of compared records of each.
+def compare_records(loaded: Any, root: Path, stream_rows: int | None, report: ReportProblem) -> dict[str, int]:
+    """Load every record set, compare each value with its text in the files, and return the number of compared records.
 
     Args:
-        loaded: the `mlcroissant.Dataset` of the package; which files its streams include is changed.
+        loaded: the `mlcroissant.Dataset` of the package in ``root``; which files its streams include is changed.
         stream_rows: number of rows to compare from the beginning of each stream; None for all.
         report: called with a file and its problem.
     """
     by_id = {node.uuid: node for node in loaded.metadata.distribution}
+    samples = {top: _files(root, top) for top in (RECORDINGS, STREAMS)}
+    unloaded = {file for files in samples.values() for file in files}
     compared = {}
-    loaded_files: set[str] = set()
     for record_set in loaded.metadata.record_sets:
         name = record_set.uuid
         source = by_id[next(f.source.uuid for f in record_set.fields)]
         if type(source).__name__ == "FileObject":
-            compared[name] = _table(name, loaded.records(name), root / source.content_url, report)
+            compared[name] = _compare(name, loaded.records(name), root, [source.content_url], None, report)
             continue
-        files = _files(dataset, name)
-        loaded_files |= {file for file, _ in files}
+        files = samples[STREAMS if name == "stream-samples" else RECORDINGS]
+        unloaded -= set(files)
         if stream_rows is None or name == "samples":
-            compared[name] = _rows(name, loaded.records(name), files, dataset, None, report)
+            compared[name] = _compare(name, loaded.records(name), root, files, None, report)
             continue
         compared[name] = 0
         for file in files:
             # Load one file at a time, so that only its beginning is parsed.
-            source.includes = [glob.escape(file[0])]
+            source.includes = [glob.escape(file)]
             records = itertools.islice(iter(loaded.records(name)), stream_rows)
-            compared[name] += _rows(name, records, [file], dataset, stream_rows, report)
-    expected = {f for name in ("samples", "stream-samples") for f, _ in _files(dataset, name)}
-    for absent in sorted(expected - loaded_files):
-        report(absent, "is in no record set of croissant.json")
+            compared[name] += _compare(name, records, root, [file], stream_rows, report)
+    for file in sorted(unloaded):
+        report(file, "is in no record set of croissant.json")
     return compared
 
 
-def _files(dataset: Dataset, name: str) -> list[tuple[str, Path]]:
-    streams = {s.file for s in dataset.streams}
-    files = {r.file for r in dataset.recordings} - streams if name == "samples" else streams
-    return [(f"{DATA}/{file}", dataset.path / file) for file in sorted(files)]
+def _files(root: Path, top: str) -> list[str]:
+    return sorted(path.relative_to(root).as_posix() for path in (root / DATA / top).rglob("*.csv"))
 
 
-def _table(name: str, records: Iterable[dict[str, Any]], path: Path, report: ReportProblem) -> int:
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    number = 0
-    for number, record in enumerate(records, 1):
-        if number > len(rows):
+def _compare(
+    name: str,
+    records: Iterable[dict[str, Any]],
+    root: Path,
+    files: list[str],
+    limit: int | None,
+    report: ReportProblem,
+) -> int:
+    """Compare records with the rows of their files, in any order of files; return the number of records."""
+    # The rows of a single file do not state it.
+    key = f"{name}/{FILE_FIELD}" if set(files) - {f"{name}.csv"} else ""
+    remaining, compared = set(files), 0
+    for value, group in itertools.groupby(records, key=lambda record: record.get(key, files[0])):
+        file = str(_plain(value))
+        if file not in remaining:
+            report(file, f"'{name}' loads it, but it is not in the data")
             continue
-        problem = ""
-        for key, value in record.items():
-            column = key.rpartition("/")[2]
-            text = rows[number - 1].get(column)
-            if text is None or not _same(value, text):
-                problem = f"row {number} has {column} {text!r}; as a record of '{name}' it is {_plain(value)!r}"
-                break
-        if not problem and len(record) != len(rows[0]):
-            problem = f"has {len(rows[0])} columns; a record of '{name}' has {len(record)}"
-        if problem:
-            report(path.name, problem)
-            return number
-    if number != len(rows):
-        report(path.name, f"holds {len(rows)} rows; '{name}' loads {number} records")
-    return number
+        remaining.remove(file)
+        loaded = [{k.rpartition("/")[2]: v for k, v in record.items() if k != key} for record in group]
+        compared += len(loaded)
+        with (root / file).open(encoding="utf-8", newline="") as table:
+            rows = list(itertools.islice(csv.DictReader(table), limit))
+        if problem := _difference(name, loaded, rows):
+            report(file, problem)
+    for file in sorted(remaining):
+        report(file, f"'{name}' does not load it")
+    return compared
+
+
+def _difference(name: str, loaded: list[dict[str, Any]], rows: list[dict[str, str]]) -> str:
+    """Return how the records of a file differ from its rows; "" if they are equal."""
+    if len(loaded) != len(rows):
+        return f"holds {len(rows)} rows; '{name}' loads {len(loaded)} records"
+    for number, (record, row) in enumerate(zip(loaded, rows, strict=True), 1):
+        if record.keys() != row.keys():
+            return f"has the columns {', '.join(map(str, row))}; a record of '{name}' has {', '.join(record)}"
+        for column, value in record.items():
+            if not _same(value, row[column]):
+                return f"row {number} has {column} {row[column]!r}; as a record of '{name}' it is {_plain(value)!r}"
+    return ""
 
 
 def _plain(value: Any) -> Any:
@@ -203,8 +215,8 @@ def _plain(value: Any) -> Any:
 
 def _same(value: Any, text: str) -> bool:
     value = _plain(value)
-    if value is None:
-        return text == ""
+    if value is None or text is None:
+        return value is None and text == ""
     if isinstance(value, bool | np.bool_):
         return text == ("true" if value else "false")
     if isinstance(value, str):
@@ -213,62 +225,3 @@ def _same(value: Any, text: str) -> bool:
         return bool(value == (int(text) if isinstance(value, int | np.integer) else float(text)))
     except ValueError:
         return False
-
-
-def _rows(
-    name: str,
-    records: Iterable[dict[str, Any]],
-    files: list[tuple[str, Path]],
-    dataset: Dataset,
-    limit: int | None,
-    report: ReportProblem,
-) -> int:
-    """Compare the rows of recordings or streams by file, in any order of files; return their number."""
-    remaining = dict(files)
-    compared = 0
-    key = f"{name}/{FILE_FIELD}"
-    for value, group in itertools.groupby(records, key=lambda record: record[key]):
-        file = str(_plain(value))
-        place = remaining.pop(file, None)
-        rows = list(group)
-        compared += len(rows)
-        if place is None:
-            report(file, f"'{name}' loads it, but it is not in the data")
-            continue
-        problem = _difference(rows, name, read_stream(place, dataset.layout).frames, dataset, limit)
-        if problem:
-            report(file, problem)
-    for file in remaining:
-        report(file, f"'{name}' does not load it")
-    return compared
-
-
-def _difference(
-    rows: list[dict[str, Any]], name: str, frames: Frames, dataset: Dataset, limit: int | None
-) -> str | None:
-    """Return how the records ``rows`` differ from ``frames``; None if they are equal."""
-    layout = dataset.layout
-    n = len(frames) if limit is None else min(limit, len(frames))
-    if len(rows) != n:
-        return f"'{name}' loads {len(rows)} of its {n} rows"
-    clocks = {DEVICE_MS: frames.device_ms, HOST_MS: frames.host_ms, "label": frames.labels}
-    expected: dict[str, Any] = clocks | dict(zip(layout.names, frames.values.T, strict=True))
-    steps = {c.name: c.step for c in layout.channels}
-    for column, values in expected.items():
-        if values is None:
-            continue
-        key = f"{name}/{column}"
-        if key not in rows[0]:
-            return f"'{name}' has no field '{column}'"
-        loaded = [row[key] for row in rows]
-        if column == "label":
-            same = [_plain(v) for v in loaded] == values[:n].tolist()
-        elif any(v is None for v in loaded):
-            same = False
-        elif steps.get(column, 1.0) == 1.0:
-            same = np.array_equal(np.array(loaded, dtype=np.int64), values[:n])
-        else:
-            same = np.array_equal(np.round(np.array(loaded) / steps[column]), values[:n])
-        if not same:
-            return f"'{name}' loads other values of {column} than the file holds"
-    return None

@@ -1,10 +1,15 @@
-"""Publish a data set as a package: require a complete description, write all files, and validate them."""
+"""Publish a data set as a package: require a complete description, write all files, and validate them.
+
+`copy_dataset` writes only the data set of a package, for people who work with PlushSense.
+"""
 
 from __future__ import annotations
 
 import re
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import partial
@@ -17,8 +22,15 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.about import Contact
+from plushsense.dataset.index import open_dataset
 from plushsense.dataset.publishing.checking import EXTRA, StageProgress, ValidationResult, check_folder
-from plushsense.dataset.publishing.contents import ContentsWriter, PublishOptions
+from plushsense.dataset.publishing.contents import (
+    ContentsSpec,
+    ContentsWriter,
+    PackageContents,
+    person_codes,
+    refuse_traces,
+)
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE, croissant
 from plushsense.dataset.publishing.description import (
     DATA,
@@ -163,16 +175,8 @@ def check_output_folder(dataset: Dataset, out: Path, repeatable: bool = True) ->
     Raises:
         DatasetError: if ``out`` is not empty or lies in the data set, or the zip exists and may not.
     """
-    real = out.resolve()
+    real = _refuse_place(dataset, out)
     target = real.with_name(real.name + ".zip")
-    if real.exists() and (not real.is_dir() or any(real.iterdir())):
-        raise DatasetError(
-            f"'{out}' already holds something: give a new or empty folder, nothing is overwritten.",
-            reason="name_exists",
-            name=out.name,
-        )
-    if dataset.path.resolve() in (real, *real.parents):
-        raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
     if target.exists() and not repeatable:
         raise DatasetError(
             f"'{target}' exists without its folder: give another OUT, or delete this zip if an interrupted publication "
@@ -183,15 +187,42 @@ def check_output_folder(dataset: Dataset, out: Path, repeatable: bool = True) ->
     return target
 
 
+def _refuse_place(dataset: Dataset, out: Path) -> Path:
+    """Return the resolved ``out``; raise DatasetError if it is not empty or lies in the data set."""
+    real = out.resolve()
+    if real.exists() and (not real.is_dir() or any(real.iterdir())):
+        raise DatasetError(
+            f"'{out}' already holds something: give a new or empty folder, nothing is overwritten.",
+            reason="name_exists",
+            name=out.name,
+        )
+    if dataset.path.resolve() in (real, *real.parents):
+        raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
+    return real
+
+
+@dataclass(frozen=True)
+class PackageSpec:
+    """What to write into a package.
+
+    Attributes:
+        contents: what to publish of the data set.
+        reidentification: None leaves the report out, which the README then states.
+        published: the day of publication in ISO format; today by default.
+        thorough: as in `validate_package`.
+    """
+
+    contents: ContentsSpec = field(default_factory=ContentsSpec)
+    reidentification: Reidentification | None = None
+    published: str = ""
+    thorough: bool = False
+
+
 def publish(
     dataset: Dataset,
     out: Path,
     head: DatasetHead,
-    *,
-    options: PublishOptions | None = None,
-    reidentification: Reidentification | None = None,
-    published: str | None = None,
-    thorough: bool = False,
+    spec: PackageSpec | None = None,
     progress: StageProgress | None = None,
 ) -> PublishResult:
     """Write the package into the new folder ``out``, validate it, and pack it as ``out.zip`` if it is valid.
@@ -200,9 +231,6 @@ def publish(
 
     Args:
         head: the head from `complete_head`.
-        reidentification: None leaves the report out, which the README then states.
-        published: the day of publication in ISO format; today by default.
-        thorough: as in `validate_package`.
         progress: called with the name of the stage, the work done and its total.
 
     Raises:
@@ -211,35 +239,19 @@ def publish(
     """
     began = time.perf_counter()
     require_validators()
+    spec = spec or PackageSpec()
     progress = progress or (lambda step, done, total: None)
     target = check_output_folder(dataset, out)
-    options = options or PublishOptions()
-    day = published or date.today().isoformat()
-    zipped = False
-    try:
-        with new_folder(out, DatasetError, finishing=dataset.generation.writing) as work:
-            contents = ContentsWriter(dataset, work / DATA, head, options, partial(progress, "writing")).write()
-            d = Description(
-                contents.dataset,
-                find_licence(head.licence),
-                head.about,
-                head.consent,
-                day,
-                write_tables(work, contents),
-                contents.notes,
-            )
-            _write_texts(work, d, dataset, reidentification)
-            _write_metadata(work, d)
-            checked = check_folder(work, thorough=thorough, progress=progress)
-            if checked.valid:
-                missing = not target.exists()
-                write_zip(work, target, dataset.generation.writing)
-                zipped = missing
-    except BaseException:
-        # A zip without its folder would be in the way of the next call, and may contain a person removed since.
-        if zipped:
-            target.unlink(missing_ok=True)
-        raise
+    with _removed_on_failure() as made, new_folder(out, DatasetError, finishing=dataset.generation.writing) as work:
+        contents = ContentsWriter(dataset, work / DATA, head, spec.contents, partial(progress, "writing")).write()
+        d = _write_metadata(work, dataset, contents, spec)
+        if spec.contents.pseudonyms:
+            refuse_traces(work, person_codes(dataset))
+        checked = check_folder(work, thorough=spec.thorough, progress=progress)
+        if checked.valid:
+            missing = not target.exists()
+            write_zip(work, target, dataset.generation.writing)
+            made += [target] * missing
     files = list_package_files(out)
     return PublishResult(
         out,
@@ -253,6 +265,82 @@ def publish(
     )
 
 
+@contextmanager
+def _removed_on_failure() -> Iterator[list[Path]]:
+    """Yield a list, and remove the files in it if an error ends the block.
+
+    A zip without its folder would be in the way of the next call, and may contain a person removed since.
+    """
+    made: list[Path] = []
+    try:
+        yield made
+    except BaseException:
+        for path in made:
+            path.unlink(missing_ok=True)
+        raise
+
+
+@dataclass(frozen=True)
+class CopyResult:
+    """Copy of a data set with shifted times; ``notes`` state what was left out or changed."""
+
+    dataset: Dataset
+    files: int
+    notes: tuple[Sentence, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "out": str(self.dataset.path),
+            "subjects": len(self.dataset.subjects),
+            "recordings": len(self.dataset.recordings),
+            "streams": len(self.dataset.streams),
+            "files": self.files,
+            "notes": list(self.notes),
+            "sentences": [sentence.to_dict() for sentence in self.notes],
+        }
+
+
+def copy_dataset(dataset: Dataset, out: Path, spec: ContentsSpec, progress: StageProgress | None = None) -> CopyResult:
+    """Write the data set that a package would contain into the new folder ``out``, without metadata and validators.
+
+    Raises:
+        DatasetError: as in `publish`.
+    """
+    _refuse_place(dataset, out)
+    steps = partial(progress, "writing") if progress is not None else lambda done, total: None
+    with new_folder(out, DatasetError, last=HEAD, finishing=dataset.generation.writing) as work:
+        contents = ContentsWriter(dataset, work, dataset.head, spec, steps).write()
+        if spec.pseudonyms:
+            refuse_traces(work, person_codes(dataset))
+        files = len(list_package_files(work))
+    return CopyResult(open_dataset(out), files, contents.notes)
+
+
+def _write_metadata(work: Path, source: Dataset, contents: PackageContents, spec: PackageSpec) -> Description:
+    """Write tables, texts and metadata files; each file exists before another one lists it."""
+    head = contents.dataset.head
+    d = Description(
+        contents.dataset,
+        find_licence(head.licence),
+        head.about,
+        head.consent,
+        spec.published or date.today().isoformat(),
+        write_tables(work, contents),
+        contents.notes,
+    )
+    _write_texts(work, d, source, spec.reidentification)
+    for path, schema in schemas(d).items():
+        (work / path).parent.mkdir(exist_ok=True)
+        write_json(work / path, schema)
+    listed = replace(d, files={path: file_entry(work / path) for table in d.tables for path in table.paths})
+    write_json(work / CROISSANT_FILE, croissant(listed))
+    write_json(work / DATAPACKAGE_FILE, datapackage(listed))
+    write_json(work / DATACITE_FILE, datacite(listed))
+    write_checksums(work)
+    return d
+
+
 def _write_texts(work: Path, d: Description, source: Dataset, reidentification: Reidentification | None) -> None:
     write_text(work / README, readme(d, reidentification.short if reidentification else None))
     own = next((source.path / name for name in _LICENCE_FILES if (source.path / name).is_file()), None)
@@ -264,18 +352,6 @@ def _write_texts(work: Path, d: Description, source: Dataset, reidentification: 
         banner = f"**{SIMULATION}**\n\n" if d.simulated else ""
         write_text(work / REIDENTIFICATION, banner + reidentification.report)
         write_json(work / REIDENTIFICATION_JSON, reidentification.figures)
-
-
-def _write_metadata(work: Path, d: Description) -> None:
-    """Write the metadata files in an order in which each file exists before another one lists it."""
-    for path, schema in schemas(d).items():
-        (work / path).parent.mkdir(exist_ok=True)
-        write_json(work / path, schema)
-    d = replace(d, files={path: file_entry(work / path) for table in d.tables for path in table.paths})
-    write_json(work / CROISSANT_FILE, croissant(d))
-    write_json(work / DATAPACKAGE_FILE, datapackage(d))
-    write_json(work / DATACITE_FILE, datacite(d))
-    write_checksums(work)
 
 
 def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[Sentence]:
@@ -292,8 +368,8 @@ def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) ->
     if without_digit:
         n, code = len(without_digit), without_digit[0]
         message = (
-            f"subject codes are published as they are, and {n} hold no digit ('{code}'): if they are names, "
-            "pseudonymise the data set first"
+            f"subject codes are published as they are, and {n} hold no digit ('{code}'): if they are names, give "
+            "--pseudonyms"
         )
         warnings.append(Sentence(message, "codes_like_names", n=n, code=code))
     if d.licence.travels and not any((source.path / name).is_file() for name in _LICENCE_FILES):

@@ -2,7 +2,7 @@
  * PlushSense: sensors that find their offset and scale themselves. Only exports of models with such sensors hold this file.
  *
  * plushsense.c takes it in and calls, from top to bottom, read_sensors, share_sensors, begin_sensors and calibrate. The rules
- * are stated in PlushSense's Python (windows/calibration), which defines what is right.
+ * are stated in PlushSense's Python (windows/self_calibration), which defines what is right.
  */
 #ifndef PLUSH_CALIBRATE_H
 #define PLUSH_CALIBRATE_H
@@ -90,7 +90,7 @@ PLUSH_SMALL static void begin_sensors(plush_toy *toy)
     memset(toy->sensor, 0, sizeof *toy->sensor * toy->sensors);
 }
 
-/* ---- Self-calibration: windows/calibration ---------------------------------------------------------------------- */
+/* ---- Self-calibration: windows/self_calibration ----------------------------------------------------------------- */
 
 #define MEAN_SIZE_BITS 12u
 #define SHARE_BITS 14u

@@ -94,7 +94,7 @@ def _ranked(
             ComparedModel(
                 name,
                 evaluation,
-                {key: summary(table[:, i]) for key, table in values.items()},
+                {key: summary(table[:, i]).to_json() for key, table in values.items()},
                 {key: float(table[i]) for key, table in ranks.items()},
                 calibration_error(evaluation.predictions.probabilities[people], evaluation.predictions.truth[people]),
             )
@@ -123,7 +123,10 @@ def _scores_of_people(evaluations: Sequence[SavedEvaluation]) -> tuple[str, list
             f"'{first.folder}' and '{other.folder}' scored different recordings ({len(recordings)} and {len(theirs)}): "
             "only evaluations of the same recordings can be compared."
         )
-    return "recordings", [votes_by_person(evaluation.predictions) for evaluation in evaluations]
+    return "recordings", [
+        {person: vote.metrics for person, vote in votes_by_person(evaluation.predictions).items()}
+        for evaluation in evaluations
+    ]
 
 
 def _scored_windows(predictions: Predictions) -> tuple[tuple[str, int], ...]:

@@ -71,7 +71,7 @@ def score_figure(result: PairedComparisonResult) -> Figure:
     axes.set_yticks(range(len(models)), names, parse_math=False)
     axes.set(xlim=(0, 1), ylim=(len(models) - 0.5, -0.5), xlabel="Mean over people, with its 95 % interval")
     _plain(axes)
-    axes.legend(fontsize=8, frameon=False, loc="lower left")
+    figure.legend(fontsize=8, frameon=False, loc="outside upper right", ncols=len(column_metrics()))
     return figure
 
 

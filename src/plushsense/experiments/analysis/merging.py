@@ -217,7 +217,7 @@ def _scores(
         truth = member.argmax(axis=1)[predictions.truth[mine]].astype(np.int64)
         for key, metric in column_metrics().items():
             values[key].append(metric.function(confusion(truth, read, len(groups))))
-    return {key: summary(found) for key, found in values.items()}
+    return {key: summary(found).to_json() for key, found in values.items()}
 
 
 def _without_defaults(gestures: GestureSet) -> dict[str, Any]:

@@ -150,7 +150,7 @@ class PairedComparisonResult:
         """Return plain values, ready for JSON."""
         return {
             "models": [model.to_json() for model in self.models],
-            "pairs": {key: [asdict(pair) for pair in pairs] for key, pairs in self.pairs.items()},
+            "pairs": {key: [pair.to_json() for pair in pairs] for key, pairs in self.pairs.items()},
             "cliques": self.cliques,
             "people": [{"subject": person, **scores} for person, scores in self.people.items()],
             "scored": self.scored,

@@ -85,8 +85,8 @@ def pair_table(result: PairedComparisonResult, key: str) -> Table:
         {
             **vars(pair),
             "pair": f"{pair.first} − {pair.second}",
-            "difference": mean_sd(pair.difference),
-            "interval": interval(pair.difference),
+            "difference": mean_sd(pair.difference.to_json()),
+            "interval": interval(pair.difference.to_json()),
             **{name: "< 0.001" if p < 0.001 else number(p) for name, p in (("p", pair.p), ("p_holm", pair.p_holm))},
         }
         for pair in result.pairs[key]

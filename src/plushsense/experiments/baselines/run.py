@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -173,12 +173,13 @@ class ComparisonSpec:
                 f"Unknown choice '{self.pca}' for PCA: accepted are {', '.join(PCA)}.{nearest(self.pca, PCA)}"
             )
 
-    def too_long(self, names: Sequence[str]) -> Iterator[str]:
-        """Yield a sentence for each program of ``names`` that is left out because it takes too long."""
+    def warn_of_long(self, warn: Warn) -> None:
+        """Warn of each program that is left out because it takes too long."""
+        names = chosen(self.models)
         for name, view, reduced in TOO_LONG:
             if name in names and view in self.features and reduced in PCA[self.pca]:
                 how = "with" if reduced else "without"
-                yield f"left out: {BASELINES[name].title} on {view} windows {how} PCA, which takes too long"
+                warn(f"left out: {BASELINES[name].title} on {view} windows {how} PCA, which takes too long")
 
 
 def contenders(spec: ComparisonSpec, run: Run, windows: WindowSet, inputs: Sequence[str]) -> list[Contender]:
@@ -240,12 +241,10 @@ def baselines(
     run = prepare(dataset, given, warn)
     dataset, identity = run.dataset, comparison_id(run, spec)
     if out is not None:
-        need("matplotlib", extra="reports")
-        need("jinja2", extra="reports")
+        _require_reports()
         check_results(Path(out), "A comparison", TABLE, identity, replace=overwrite)
     windows = run.scored_windows(warn)
-    for sentence in spec.too_long(chosen(spec.models)):
-        warn(sentence)
+    spec.warn_of_long(warn)
     compared = compare(
         windows,
         contenders(spec, run, windows, inputs),
@@ -270,6 +269,11 @@ def baselines(
         with dataset.generation.writing():
             save_baselines(result, Path(out))
     return result
+
+
+def _require_reports() -> None:
+    for library in ("matplotlib", "jinja2"):
+        need(library, extra="reports")
 
 
 def comparison_id(run: Run, spec: ComparisonSpec) -> str:

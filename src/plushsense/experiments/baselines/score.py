@@ -338,7 +338,7 @@ def _row(windows: WindowSet, done: Sequence[tuple[StudyPart, Result]]) -> Progra
         for f, o in zip(folds, outcomes, strict=True)
     ]
     predictions = gather_predictions(windows, [(f.name, f.test) for f in folds], [o["probabilities"] for o in outcomes])
-    table = compute_scores(predictions, records, windows.affects, split.separates_people)
+    scores = compute_scores(predictions, records, windows.affects, split.separates_people)
 
     def middle(name: str) -> float:
         return float(np.median([o[name] for o in outcomes]))
@@ -352,11 +352,11 @@ def _row(windows: WindowSet, done: Sequence[tuple[StudyPart, Result]]) -> Progra
         split.text,
         split.leaky,
         split.separates_people,
-        table["over"],
+        scores.over,
         len(folds),
-        {name: table[name] for name in column_metrics()},
-        table["pooled"],
-        table["by_recording"],
+        {name: scores.means[name].to_json() for name in column_metrics()},
+        scores.pooled,
+        scores.by_recording.to_json(),
         round(middle("size_bytes")),
         middle("predict_ms"),
         middle("predict_batch_ms"),

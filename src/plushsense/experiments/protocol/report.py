@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plushsense.experiments.protocol.score import GROUPS, NAMELESS, PrintedFigures
+from plushsense.experiments.protocol.score import GROUPS, NAMELESS, PrintedFigures, ProtocolResult, SummaryRow
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
 from plushsense.reports.table import DASH, Column, Table, number
@@ -63,37 +63,37 @@ _PAPER_CELLS = tuple(
 )
 
 
-def _cells(row: Mapping[str, Any], energetic: bool) -> dict[str, str]:
-    n = row["trials"]
+def _cells(row: SummaryRow, energetic: bool) -> dict[str, str]:
+    found, n = row.figures, row.figures.trials
     return {
-        "answered": percent(row["activated"], n),
-        "named": DASH if row["system"] in NAMELESS else percent(row["named"], n),
-        "median": seconds(row["reaction_s"]["median"]),
-        "p90": seconds(row["reaction_s"]["p90"]),
-        "quick": percent(row["within_200_ms"], n) if energetic else "",
-        "likelihood": number(row["likelihood"], 2),
-        "negative": percent(row["called_negative"], row["gentle"]) if row["gentle"] else "",
+        "answered": percent(found.activated, n),
+        "named": DASH if row.system in NAMELESS else percent(found.named, n),
+        "median": seconds(found.reaction_s["median"]),
+        "p90": seconds(found.reaction_s["p90"]),
+        "quick": percent(found.within_200_ms, n) if energetic else "",
+        "likelihood": number(found.likelihood, 2),
+        "negative": percent(found.called_negative, found.gentle) if found.gentle else "",
     }
 
 
-def group_table(result: Mapping[str, Any]) -> Table:
+def group_table(result: ProtocolResult) -> Table:
     """Return one row for each group and system, with the paper's figures if it has any for these groups."""
     rows: list[dict[str, Any]] = []
     last = None
-    for row in result["rows"]:
-        paper = PAPER.get((row["group"], row["system"]), PrintedFigures())
-        first = row["group"] != last
+    for row in result.scored.rows:
+        paper = PAPER.get((row.group, row.system), PrintedFigures())
+        first = row.group != last
         rows.append(
             {
-                "title": row["title"] if first else "",
-                "trials": str(row["trials"]) if first else "",
-                "system": _SHORT[row["system"]],
-                **_cells(row, row["group"] in ("energetic", "fast")),
+                "title": row.title if first else "",
+                "trials": str(row.figures.trials) if first else "",
+                "system": _SHORT[row.system],
+                **_cells(row, row.group in ("energetic", "fast")),
                 **{f"paper_{key}": getattr(paper, key) or DASH for key in _PRINTED},
                 "class": "top" if first else "",
             }
         )
-        last = row["group"]
+        last = row.group
     columns = (
         Column("title", "Gestures", plain="gesture"),
         Column("trials", "Trials", "right", plain="trials"),
@@ -104,23 +104,23 @@ def group_table(result: Mapping[str, Any]) -> Table:
     return Table("groups", "By group of gestures", columns, tuple(rows))
 
 
-def gesture_table(result: Mapping[str, Any]) -> Table:
+def gesture_table(result: ProtocolResult) -> Table:
     """Return one row for each gesture and system."""
     rows: list[dict[str, Any]] = []
-    energetic = {o["gesture"] for o in result["outcomes"] if o["group"] in ("energetic", "fast")}
+    energetic = {o.gesture for o in result.scored.outcomes if o.group in ("energetic", "fast")}
     last = None
-    for row in result["by_gesture"]:
-        first = row["gesture"] != last
+    for row in result.scored.by_gesture:
+        first = row.gesture != last
         rows.append(
             {
-                "title": row["gesture"] if first else "",
-                "system": _SHORT[row["system"]],
-                **_cells(row, row["gesture"] in energetic),
-                "called": DASH if row["system"] in NAMELESS else _judgements(row["called"]),
+                "title": row.gesture if first else "",
+                "system": _SHORT[row.system],
+                **_cells(row, row.gesture in energetic),
+                "called": DASH if row.system in NAMELESS else _judgements(row.figures.called),
                 "class": "top" if first else "",
             }
         )
-        last = row["gesture"]
+        last = row.gesture
     heads = ("Answered", "Named right", "Median, s", "p90, s", "≤ 0.2 s", "Likelihood", "Called negative")
     cells = (replace(c, head=head, group="") for c, head in zip(_CELLS, heads, strict=True))
     columns: tuple[Column, ...] = (Column("title", "Gesture"), Column("system", "System"), *cells)
@@ -133,26 +133,26 @@ def _judgements(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{n} {_JUDGED[judged]}" for judged, n in counts.items() if n) or DASH
 
 
-def judged_table(result: Mapping[str, Any]) -> Table:
+def judged_table(result: ProtocolResult) -> Table:
     """Return one row for each group and system with a network: how its first gesture compares with the true one."""
     rows = tuple(
-        {"title": row["title"], "system": _SHORT[row["system"]]}
-        | {judged: percent(row["called"][judged], row["trials"]) for judged in _JUDGED}
-        for row in result["rows"]
-        if row["system"] not in NAMELESS
+        {"title": row.title, "system": _SHORT[row.system]}
+        | {judged: percent(row.figures.called[judged], row.figures.trials) for judged in _JUDGED}
+        for row in result.scored.rows
+        if row.system not in NAMELESS
     )
     columns: tuple[Column, ...] = (Column("title", "Gestures"), Column("system", "System"))
     columns += tuple(Column(judged, head, "right") for judged, head in _JUDGED.items())
     return Table("judged", "What was said first", columns, rows)
 
 
-def confusion_table(result: Mapping[str, Any]) -> Table:
+def confusion_table(result: ProtocolResult) -> Table:
     """Return one row for each true family and system with a network: the recognised families, most frequent first."""
     called: dict[tuple[str, str], list[str]] = {}
-    for entry in result["confusions"]:
-        if entry["system"] not in NAMELESS:
-            name = entry["called"] or "not named"
-            called.setdefault((entry["did"], entry["system"]), []).append(f"{name} {100 * entry['share']:.0f} %")
+    for entry in result.scored.confusions:
+        if entry.system not in NAMELESS:
+            name = entry.called or "not named"
+            called.setdefault((entry.did, entry.system), []).append(f"{name} {100 * (entry.share or 0.0):.0f} %")
     rows = tuple(
         {"did": did, "system": _SHORT[system], "called": ", ".join(called[did, system])}
         for did in dict.fromkeys(did for did, _ in called)
@@ -167,17 +167,17 @@ def confusion_table(result: Mapping[str, Any]) -> Table:
     return Table("confusions", "Confusions of families", columns, rows)
 
 
-def between_table(result: Mapping[str, Any]) -> Table:
+def between_table(result: ProtocolResult) -> Table:
     """Return one row for each system with its events that began outside all trials."""
     rows = tuple(
         {
-            **row,
-            "system": _SHORT[row["system"]],
-            "minutes": f"{60 * row['hours']:.0f}",
-            "reactions": number(row["reactions_per_hour"], 1),
-            "negatives": number(row["negative_per_hour"], 1),
+            **vars(row),
+            "system": _SHORT[row.system],
+            "minutes": f"{60 * row.hours:.0f}",
+            "reactions": number(row.reactions_per_hour, 1),
+            "negatives": number(row.negative_per_hour, 1),
         }
-        for row in result["between"]
+        for row in result.scored.between
     )
     columns = (
         Column("system", "System"),
@@ -192,73 +192,73 @@ def between_table(result: Mapping[str, Any]) -> Table:
     return Table("between", "Between the gestures", columns, rows)
 
 
-def aim_table(result: Mapping[str, Any]) -> Table:
+def aim_table(result: ProtocolResult) -> Table:
     """Return one row for each aim of the project: the measured value, and whether the aim is met."""
     rows = []
-    for aim in result["aims"]:
-        measured = seconds(aim["measured"]) + " s" if aim["unit"] == "s" else percent(aim["part"], aim["of"])
-        met = {None: "not measured", True: "met", False: "NOT met"}[aim["met"]]
+    for aim in result.aims:
+        measured = seconds(aim.measured) + " s" if aim.part is None else percent(aim.part, aim.of)
+        met = {None: "not measured", True: "met", False: "NOT met"}[aim.met]
         rows.append(
             {
-                "aim": aim["aim"],
-                "measured": DASH if aim["met"] is None else measured,
+                "aim": aim.aim,
+                "measured": DASH if aim.met is None else measured,
                 "met": met,
-                "class": "unmet" if aim["met"] is False else "",
+                "class": "unmet" if aim.met is False else "",
             }
         )
     columns = (Column("aim", "Aim"), Column("measured", "Measured", "right"), Column("met", "\N{NO-BREAK SPACE}"))
     return Table("aims", "What we aim at", columns, tuple(rows))
 
 
-def figure_table(result: Mapping[str, Any]) -> Table:
+def figure_table(result: ProtocolResult) -> Table:
     """Return one row for each group and each gesture by system, as numbers for CSV, with the paper's figures."""
     rows = []
-    for kind, key in (("rows", "group"), ("by_gesture", "gesture")):
-        for row in result[kind]:
-            paper = PAPER.get((row[key], row["system"]), PrintedFigures())
-            rows.append(
-                {
-                    "of": key,
-                    "name": row["title"] if key == "group" else row["gesture"],
-                    "system": row["system"],
-                    **{k: row[k] for k in ("trials", "activated", "activation", "named", "gesture_activation")},
-                    "reaction_median_s": row["reaction_s"]["median"],
-                    "reaction_p90_s": row["reaction_s"]["p90"],
-                    **{k: row[k] for k in ("within_200_ms", "likelihood", "gentle", "called_negative")},
-                    **{f"said_first_{judged}": n for judged, n in row["called"].items()},
-                    **{f"paper_{key}": getattr(paper, key) for key in _PRINTED},
-                    "simulated": "yes" if result["simulated"] else "no",
-                }
-            )
+    for row in (*result.scored.rows, *result.scored.by_gesture):
+        paper = PAPER.get((row.group, row.system), PrintedFigures())
+        found = row.figures
+        rows.append(
+            {
+                "of": "group" if row.gesture is None else "gesture",
+                "name": row.title if row.gesture is None else row.gesture,
+                "system": row.system,
+                **{k: getattr(found, k) for k in ("trials", "activated", "activation", "named", "gesture_activation")},
+                "reaction_median_s": found.reaction_s["median"],
+                "reaction_p90_s": found.reaction_s["p90"],
+                **{k: getattr(found, k) for k in ("within_200_ms", "likelihood", "gentle", "called_negative")},
+                **{f"said_first_{judged}": n for judged, n in found.called.items()},
+                **{f"paper_{key}": getattr(paper, key) for key in _PRINTED},
+                "simulated": "yes" if result.simulated else "no",
+            }
+        )
     return Table.from_rows("table", "Figures of every group and gesture", rows)
 
 
-def has_paper(result: Mapping[str, Any]) -> bool:
+def has_paper(result: ProtocolResult) -> bool:
     """Return whether the paper has figures for any group and system of the result."""
-    return any((row["group"], row["system"]) in PAPER for row in result["rows"])
+    return any((row.group, row.system) in PAPER for row in result.scored.rows)
 
 
-def figure(result: Mapping[str, Any]) -> Figure:
+def figure(result: ProtocolResult) -> Figure:
     """Draw the reaction times of all trials by group and system: medians, unanswered trials, and the paper's ranges."""
-    rows = [row for row in result["rows"] if row["group"] != "all"]
+    rows = [row for row in result.scored.rows if row.group != "all"]
     picture = new_figure(10.0, 1.6 + 0.42 * len(rows))
     axes = picture.add_subplot()
     rng = np.random.default_rng(0)
     places, names = [], []
     y, last = 0.0, None
     drawn: set[str] = set()
-    longest = max((o["reaction_s"] for o in result["outcomes"] if o["reaction_s"] is not None), default=1.0)
+    longest = max((o.reaction_s for o in result.scored.outcomes if o.reaction_s is not None), default=1.0)
     right = max(3.4, longest) + 0.2
     for row in rows:
-        y += 1.6 if last not in (None, row["group"]) else 1.0
-        last = row["group"]
-        colour, mark = _LOOKS[row["system"]]
+        y += 1.6 if last not in (None, row.group) else 1.0
+        last = row.group
+        colour, mark = _LOOKS[row.system]
         times = [
-            o["reaction_s"]
-            for o in result["outcomes"]
-            if o["group"] == row["group"] and o["system"] == row["system"] and o["reaction_s"] is not None
+            o.reaction_s
+            for o in result.scored.outcomes
+            if o.group == row.group and o.system == row.system and o.reaction_s is not None
         ]
-        paper = PAPER.get((row["group"], row["system"]), PrintedFigures()).reaction_s
+        paper = PAPER.get((row.group, row.system), PrintedFigures()).reaction_s
         if paper:
             low, high = paper
             axes.plot(
@@ -269,19 +269,19 @@ def figure(result: Mapping[str, Any]) -> Figure:
         spread = y + rng.uniform(-0.26, 0.26, len(times))
         axes.scatter(
             times, spread, s=13, marker=mark, facecolor=colour, edgecolor="none", alpha=0.45, zorder=2,
-            label=None if row["system"] in drawn else _SHORT[row["system"]],
+            label=None if row.system in drawn else _SHORT[row.system],
         )  # fmt: skip
-        drawn.add(row["system"])
+        drawn.add(row.system)
         if times:
             middle = float(np.median(times))
             axes.plot([middle, middle], [y - 0.38, y + 0.38], color="#000000", linewidth=1.8, zorder=3)
-        missed = row["trials"] - len(times)
+        missed = row.figures.trials - len(times)
         axes.text(
-            right + 0.08, y, f"{missed} of {row['trials']} not answered" if missed else "all answered",
+            right + 0.08, y, f"{missed} of {row.figures.trials} not answered" if missed else "all answered",
             va="center", fontsize=8, color="#b3261e" if missed else "#57606a",
         )  # fmt: skip
         places.append(y)
-        names.append(f"{row['title']}: {_SHORT[row['system']].lower()}")
+        names.append(f"{row.title}: {_SHORT[row.system].lower()}")
     axes.axvline(0.0, color="#57606a", linewidth=0.8)
     axes.set_yticks(places, names, fontsize=8.5, parse_math=False)
     axes.set_ylim(y + 0.8, 0.2)
@@ -290,26 +290,26 @@ def figure(result: Mapping[str, Any]) -> Figure:
     axes.grid(axis="x", color="#dddddd", linewidth=0.5)
     axes.spines[["top", "right"]].set_visible(False)
     picture.legend(loc="outside upper right", ncols=4, fontsize=8, frameon=False)
-    axes.set_title("SIMULATION" if result["simulated"] else "", fontsize=10, loc="left")
+    axes.set_title("SIMULATION" if result.simulated else "", fontsize=10, loc="left")
     return picture
 
 
-def page(result: Mapping[str, Any]) -> str:
+def page(result: ProtocolResult) -> str:
     """Return the result of the protocol as one self-contained HTML page."""
     return render_page(
         "protocol.html.j2",
-        title=result["heading"],
-        simulated=result["simulated"],
-        about=result["about"],
-        remarks=result["said"],
+        title=result.heading,
+        simulated=result.simulated,
+        about=result.about,
+        remarks=result.said,
         aims=aim_table(result),
         groups=group_table(result),
         gestures=gesture_table(result),
         judged=judged_table(result),
         confusions=confusion_table(result),
         between=between_table(result),
-        left=result["left"],
+        left=result.left,
         with_paper=has_paper(result),
-        counted=result["counted"],
+        counted=result.counted,
         picture=data_uri(figure(result)),
     )

@@ -7,9 +7,9 @@ import os
 import tempfile
 from collections.abc import Collection, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.files import temporary_folder, write_file
@@ -19,17 +19,25 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.quantize import integer_model
-from plushsense.experiments.protocol import score as scoring
-from plushsense.experiments.protocol.score import NOTES, RuleBaseline
+from plushsense.experiments.protocol.score import (
+    NOTES,
+    ProtocolResult,
+    RuleBaseline,
+    ScoredTrials,
+    aims,
+    score_sittings,
+)
 from plushsense.experiments.protocol.sittings import (
     FIRST_STRANGER,
-    Progress,
+    LeftOut,
     Sitting,
+    VirtualSitting,
     recorded_people,
     recorded_sittings,
     virtual_numbers,
     virtual_sittings,
 )
+from plushsense.jobs.study import Progress
 from plushsense.models.arch import slashed
 from plushsense.models.bundle import Bundle, known_people
 from plushsense.recording.simulate import simulate
@@ -47,7 +55,7 @@ def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int =
         raw, folder = Path(work) / "raw", Path(work) / "ds"
         simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
         dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
-        settings, _ = fit_rule_baseline(dataset, gestures, dataset.subjects)
+        settings = fit_rule_baseline(dataset, gestures, dataset.subjects)
     baseline = partial(rule_baseline_events, layout=layout, settings=settings)
     return baseline, f"Tuned on {people} other virtual people, of another population."
 
@@ -58,7 +66,7 @@ def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[st
     if not others:
         return None, "Everybody is scored here, so nobody is left to tune the rule baseline on: it is left out."
     try:
-        settings, _ = fit_rule_baseline(dataset, gestures, others)
+        settings = fit_rule_baseline(dataset, gestures, others)
     except ConfigError as cause:
         return None, f"The rule baseline cannot be tuned: {cause}"
     baseline = partial(rule_baseline_events, layout=dataset.layout, settings=settings)
@@ -72,10 +80,7 @@ ENGINES = ("float", "int8")
 def protocol(
     model: Bundle | str | os.PathLike[str],
     *,
-    people: int = 5,
-    first: int = FIRST_STRANGER,
-    seed: int = 1,
-    repetitions: int = 3,
+    virtual: VirtualPeople | None = None,
     dataset: Dataset | str | os.PathLike[str] | None = None,
     session: str | os.PathLike[str] | None = None,
     subjects: Sequence[str] | None = None,
@@ -83,12 +88,12 @@ def protocol(
     rules: bool = True,
     out: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
-) -> dict[str, Any]:
+) -> ProtocolResult:
     """Run the protocol, score rules, network and hybrid, and write table, trials and page.
 
     Args:
         model: a bundle; its own decision settings, including the gate, are used.
-        people, first, seed, repetitions: number of virtual people, first number, population, repetitions of a gesture.
+        virtual: the virtual people who touch the toy, unless a data set or session is given.
         dataset, session: recorded sessions instead of virtual people: a data set, or a recorder's output folder.
         subjects: people of that data set or session; default: all on whom the network was neither trained nor chosen.
         engine: ``float``, or ``int8`` for the integer arithmetic of the deployed network.
@@ -107,11 +112,9 @@ def protocol(
     if subjects is not None and dataset is None and session is None:
         raise ConfigError("Subjects are people of a data set or session; of virtual people give their number.")
     place = None if out is None else _place(Path(out))
-    asked = integer_model(bundle) if engine == "int8" else bundle
-    made: dict[str, Any]
     if dataset is not None:
         dataset = as_dataset(dataset)
-        made = _recorded(dataset, bundle, asked, subjects, rules, progress)
+        scene = _recorded(dataset, bundle, subjects, rules)
     elif session is not None:
         with temporary_folder() as work:
             folder = work / "session"
@@ -123,26 +126,13 @@ def protocol(
                 name=Path(session).resolve().name,
                 adopt_proposals=False,
             )
-            made = _recorded(as_dataset(folder), bundle, asked, subjects, rules, progress)
+            scene = _recorded(as_dataset(folder), bundle, subjects, rules)
     else:
-        numbers = virtual_numbers(people, first, bundle.provenance)
-        sittings = virtual_sittings(numbers, seed, repetitions, bundle.layout)
-        baseline, tuned = virtual_rules(seed, bundle.layout, bundle.gestures) if rules else (None, NOTES["no_rules"])
-        made = scoring.run(sittings, asked, baseline, progress, len(numbers))
-        whom = f"{people} virtual, number {numbers[0]} to {numbers[-1]} of the population of seed {seed}"
-        made |= {
-            "heading": "The paper's real-time protocol, SIMULATED",
-            "simulated": True,
-            "left": [],
-            "people_text": whom,
-            "rules_text": tuned,
-            "aims": scoring.aims(made),
-            "counted": [NOTES[key] for key in ("answered", "onset_virtual", "likelihood")],
-        }
-    result = _with_notes(made, bundle, engine)
+        scene = _virtual(virtual or VirtualPeople(), bundle, rules)
+    result = _scored(scene, bundle, engine, progress)
     if place is not None:
         with nullcontext() if dataset is None else as_dataset(dataset).generation.writing():
-            result["files"] = _write(result, place)
+            result = _write(result, place)
     return result
 
 
@@ -154,7 +144,7 @@ def live_protocol(
     tune_on: Dataset | None = None,
     simulated: bool = False,
     out: str | os.PathLike[str] | None = None,
-) -> dict[str, Any]:
+) -> ProtocolResult:
     """Score sittings in which people were prompted live, and write the same files as `protocol`.
 
     Args:
@@ -167,36 +157,71 @@ def live_protocol(
         baseline, tuned = recorded_rules(tune_on, bundle.gestures, people)
     place = None if out is None else _place(Path(out))
     noted = ("noted",) if any(s.reactions is not None for s in sittings) else ()
-    made = scoring.run(sittings, integer_model(bundle) if engine == "int8" else bundle, baseline)
-    result = _with_notes(
-        made
-        | {
-            "heading": f"The paper's real-time protocol, led live{', SIMULATED' if simulated else ''}",
-            "simulated": simulated,
-            "codes": people,
-            "left": [],
-            "people_text": ", ".join(people),
-            "rules_text": tuned,
-            "aims": [],
-            "counted": [NOTES[key] for key in ("answered", "onset_live", "likelihood", *noted)],
-        },
-        bundle,
-        engine,
+    scene = _Scene(
+        tuple(sittings),
+        baseline,
+        tuned,
+        f"The paper's real-time protocol, led live{', SIMULATED' if simulated else ''}",
+        simulated,
+        ", ".join(people),
+        ("answered", "onset_live", "likelihood", *noted),
+        tuple(people),
     )
-    if place is not None:
-        result["files"] = _write(result, place)
-    return result
+    result = _scored(scene, bundle, engine)
+    return result if place is None else _write(result, place)
 
 
-def _recorded(
-    dataset: Dataset,
-    bundle: Bundle,
-    asked: Any,
-    subjects: Sequence[str] | None,
-    rules: bool,
-    progress: Progress | None,
-) -> dict[str, Any]:
-    """Run the protocol on recorded sessions and return the result."""
+@dataclass(frozen=True)
+class VirtualPeople:
+    """Virtual people: how many, the first one's number, the population's seed, and repetitions of each gesture."""
+
+    people: int = 5
+    first: int = FIRST_STRANGER
+    seed: int = 1
+    repetitions: int = 3
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Sittings to score with a rule baseline, and how the result describes them.
+
+    ``tuned`` is a sentence on the baseline, ``people`` describes the people, ``counted`` are keys of `NOTES`; ``codes``
+    are codes of real people, who may be known to the bundle.
+    """
+
+    sittings: tuple[Sitting | VirtualSitting, ...]
+    baseline: RuleBaseline | None
+    tuned: str
+    heading: str
+    simulated: bool
+    people: str
+    counted: tuple[str, ...]
+    codes: tuple[str, ...] = ()
+    left: tuple[LeftOut, ...] = ()
+    with_aims: bool = False
+
+
+def _virtual(virtual: VirtualPeople, bundle: Bundle, rules: bool) -> _Scene:
+    numbers = virtual_numbers(virtual.people, virtual.first, bundle.provenance)
+    sittings = virtual_sittings(numbers, virtual.seed, virtual.repetitions, bundle.layout)
+    baseline, tuned = None, NOTES["no_rules"]
+    if rules:
+        baseline, tuned = virtual_rules(virtual.seed, bundle.layout, bundle.gestures)
+    whom = f"{virtual.people} virtual, number {numbers[0]} to {numbers[-1]} of the population of seed {virtual.seed}"
+    return _Scene(
+        tuple(sittings),
+        baseline,
+        tuned,
+        "The paper's real-time protocol, SIMULATED",
+        True,
+        whom,
+        ("answered", "onset_virtual", "likelihood"),
+        with_aims=True,
+    )
+
+
+def _recorded(dataset: Dataset, bundle: Bundle, subjects: Sequence[str] | None, rules: bool) -> _Scene:
+    """Return the recorded sessions of people of a data set."""
     if not dataset.layout.reads_as(bundle.layout):
         raise ConfigError(
             f"'{dataset.head.name}' was recorded with layout '{dataset.layout.name}', but the network reads "
@@ -205,67 +230,83 @@ def _recorded(
     people = recorded_people(dataset, subjects, bundle.provenance)
     sittings, left = recorded_sittings(dataset, people, bundle.gestures)
     baseline, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NOTES["no_rules"])
-    made = scoring.run(sittings, asked, baseline, progress, len(sittings))
-    virtual = dataset.head.simulated
-    source = "recorded sessions of a simulation" if virtual else "recorded sessions"
-    return made | {
-        "heading": f"The paper's real-time protocol on {source}: {dataset.head.name}",
-        "simulated": virtual,
-        "codes": people,
-        "left": left,
-        "people_text": f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
+    source = "recorded sessions of a simulation" if dataset.head.simulated else "recorded sessions"
+    return _Scene(
+        tuple(sittings),
+        baseline,
+        tuned,
+        f"The paper's real-time protocol on {source}: {dataset.head.name}",
+        dataset.head.simulated,
+        f"{len({s.who.partition(',')[0] for s in sittings})} of {len(dataset.subjects)}: "
         + ", ".join(s.who for s in sittings),
-        "rules_text": tuned,
-        "aims": [],
-        "counted": [NOTES[key] for key in ("answered", "onset_recorded", "likelihood")],
-    }
+        ("answered", "onset_recorded", "likelihood"),
+        tuple(people),
+        tuple(left),
+    )
 
 
-def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
-    """Return the result with ``about``, rows on network and settings, and ``said``, notes on their limits."""
+def _scored(scene: _Scene, bundle: Bundle, engine: str, progress: Progress | None = None) -> ProtocolResult:
+    """Score the sittings, and add rows on network and settings, and notes on their limits."""
+    model = integer_model(bundle) if engine == "int8" else bundle
+    scored = score_sittings(scene.sittings, model, scene.baseline, progress)
+    return ProtocolResult(
+        scored,
+        scene.heading,
+        scene.simulated,
+        scene.left,
+        tuple(aims(scored.outcomes)) if scene.with_aims else (),
+        tuple(NOTES[key] for key in scene.counted),
+        tuple(_notes(scene, scored, bundle)),
+        tuple(_about(scene, scored, bundle, engine)),
+        engine,
+    )
+
+
+def _notes(scene: _Scene, scored: ScoredTrials, bundle: Bundle) -> list[str]:
+    """Return notes on the limits of the figures."""
     settings = DecideSpec.from_dict(bundle.decision)
-    provenance = bundle.provenance
     notes = []
     if not settings.gate.rules:
         notes.append(NOTES["no_gate"])
-    ruled = any(row["system"] == "rules" for row in made["systems"])
-    tuned = made.pop("rules_text")
-    if not ruled:
-        notes.append(tuned)
+    if "rules" not in scored.systems:
+        notes.append(scene.tuned)
     if not bundle.gestures.has_affect:
         notes.append(NOTES["no_affect"])
     if not settings.fitted:
         notes.append(NOTES["not_fitted"])
-    known = known_people(provenance)
+    known = known_people(bundle.provenance)
     if not known:
         notes.append(NOTES["unknown_people"])
     known |= {bundle.adapted_to} if bundle.adapted_to is not None else set()
-    met = sorted(known & set(made.pop("codes", ())))
+    met = sorted(known & set(scene.codes))
     if met:
         notes.append(
             f"This bundle was trained on, or adapted to, people of the codes {', '.join(met)}: if they are the same "
             "people, their figures flatter."
         )
-    if provenance.get("simulated") is True and not made["simulated"]:
+    if bundle.provenance.get("simulated") is True and not scene.simulated:
         notes.append(NOTES["trained_virtual"])
-    notes += [f"{entry['who']} {entry['why']}, and was left out." for entry in made["left"]]
+    return notes + [f"{one.who} {one.why}, and was left out." for one in scene.left]
+
+
+def _about(scene: _Scene, scored: ScoredTrials, bundle: Bundle, engine: str) -> list[tuple[str, str]]:
+    """Return rows (name, value) on people, network and settings."""
+    settings, provenance = DecideSpec.from_dict(bundle.decision), bundle.provenance
     filters, span_s = slashed(bundle.arch.filters), bundle.arch.span / bundle.layout.rate_hz
     subjects = provenance.get("subjects", ())
     who = subjects if isinstance(subjects, int) else len(set(subjects) - {NOBODY})
     trained = f"{provenance['dataset']}, {who} people" if provenance.get("dataset") else "unknown to the bundle"
-    times = [o["repetition"] for o in made["outcomes"]]
+    times = max((o.repetition for o in scored.outcomes), default=0)
     about = [
-        ["People", made.pop("people_text")],
-        ["Trials", f"{made['trials']}: {made['gestures']} gestures, up to {max(times, default=0)} times each a person"],
-        ["Network", f"{bundle.arch.symbol}, filters {filters}, {bundle.arch.padding}; span {span_s:.2f} s"],
-        ["Trained on", trained],
-        ["Arithmetic", "8 bits, the toy's own" if engine == "int8" else "floating point"],
-        ["Gate", {0: "none", 1: "1 rule"}.get(len(settings.gate.rules), f"{len(settings.gate.rules)} rules")],
-        ["Event settings", "fitted" if settings.fitted else "defaults, not fitted"],
+        ("People", scene.people),
+        ("Trials", f"{scored.trials}: {scored.gestures} gestures, up to {times} times each a person"),
+        ("Network", f"{bundle.arch.symbol}, filters {filters}, {bundle.arch.padding}; span {span_s:.2f} s"),
+        ("Trained on", trained),
+        ("Arithmetic", "8 bits, the toy's own" if engine == "int8" else "floating point"),
+        ("Gate", {0: "none", 1: "1 rule"}.get(len(settings.gate.rules), f"{len(settings.gate.rules)} rules")),
+        ("Event settings", "fitted" if settings.fitted else "defaults, not fitted"),
     ]
-    if ruled:
-        about.append(["Rule baseline", tuned])
-    return made | {"said": notes, "about": about, "engine": engine}
+    return about + ([("Rule baseline", scene.tuned)] if "rules" in scored.systems else [])
 
 
 def _place(out: Path) -> Path:
@@ -276,16 +317,17 @@ def _place(out: Path) -> Path:
     return out
 
 
-def _write(result: dict[str, Any], out: Path) -> list[str]:
+def _write(result: ProtocolResult, out: Path) -> ProtocolResult:
+    """Write the files of a result, and return it with their paths."""
     from plushsense.experiments.protocol.report import figure_table, page
     from plushsense.reports.page import write_page
     from plushsense.reports.table import Table
 
     html = page(result)  # before any file, as it may lack an extra
     out.mkdir(parents=True, exist_ok=True)
-    trials = Table.from_rows("trials", "Every trial by each system", result["outcomes"])
-    write_file(out / TRIALS, trials.csv({"simulated": "yes" if result["simulated"] else "no"}))
+    trials = Table.from_rows("trials", "Every trial by each system", [dict(vars(o)) for o in result.scored.outcomes])
+    write_file(out / TRIALS, trials.csv({"simulated": "yes" if result.simulated else "no"}))
     write_file(out / TABLE, figure_table(result).csv())
     write_page(out / PAGE, html)
-    write_file(out / RESULT, json.dumps(result, ensure_ascii=False, indent=1, allow_nan=False) + "\n")
-    return [str(out / name) for name in (PAGE, TABLE, TRIALS, RESULT)]
+    write_file(out / RESULT, json.dumps(result.to_json(), ensure_ascii=False, indent=1, allow_nan=False) + "\n")
+    return replace(result, files=tuple(str(out / name) for name in (PAGE, TABLE, TRIALS, RESULT)))

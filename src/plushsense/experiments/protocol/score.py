@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import mean, median
@@ -15,7 +16,10 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.toml import load_table, read_toml
-from plushsense.experiments.protocol.sittings import GestureTrial, Progress, Sitting
+from plushsense.experiments.protocol.sittings import GestureTrial, LeftOut, Sitting, VirtualSitting
+from plushsense.jobs.journal import Result
+from plushsense.jobs.pool import Report
+from plushsense.jobs.study import Progress, StudyPart, StudyResults, run_study
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import GestureEvent, events_of
 from plushsense.runtime.decisions import DecideSpec
@@ -194,10 +198,6 @@ class TrialOutcome:
     already: bool
     source: str | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON or CSV."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Between:
@@ -295,93 +295,57 @@ def _judged(made: Gesture, called: Gesture | None) -> str:
     return "affect" if called.affect == made.affect != "none" else "wrong"
 
 
-def run(
-    sittings: Iterable[Sitting],
-    model: Bundle | IntegerModel,
-    baseline: RuleBaseline | None = None,
-    progress: Progress | None = None,
-    of: int = 0,
-) -> dict[str, Any]:
-    """Run every system on every sitting, and summarise the outcomes.
+@dataclass(frozen=True)
+class TrialSummary:
+    """Figures of the trials of one system: shares are of all ``trials``, times only of those that were answered.
 
-    Args:
-        of: number of sittings, for ``progress``; 0 if unknown.
-
-    Returns:
-        ``people``, ``trials``, ``systems``, ``rows`` (a `summary` of each group and of all trials), ``by_gesture``,
-        ``confusions`` (see `confusions`), ``between`` and ``outcomes``.
+    ``called`` counts the values of `TrialOutcome.judged`; ``reaction_s`` and ``gesture_s`` hold median and p90.
     """
-    gestures = model.gestures
-    outcomes: list[TrialOutcome] = []
-    between: dict[str, list[Between]] = {}
-    people: list[str] = []
-    for done, sitting in enumerate(sittings, 1):
-        people.append(sitting.who)
-        outputs = system_outputs(sitting.frames, model, baseline)
-        if sitting.reactions is not None:
-            outputs["toy"] = noted_output(sitting.reactions)
-        for system, output in outputs.items():
-            made, stray = score(sitting, system, output, gestures)
-            outcomes += made
-            between.setdefault(system, []).append(stray)
-        if progress is not None:
-            progress(done, of or done)
-    systems = [key for key in SYSTEMS if key in between]
-    by_system = {key: [o for o in outcomes if o.system == key] for key in systems}
-    groups = [g for g in GROUPS if any(o.group == g for o in outcomes)]
-    labels = [g for g in gestures.labels if any(o.gesture == g for o in outcomes)]
-    return {
-        "people": people,
-        "trials": len(by_system[systems[0]]),
-        "gestures": len(labels),
-        "systems": [{"system": key, "title": SYSTEMS[key]} for key in systems],
-        "rows": [
-            {"group": group, "title": GROUPS[group].title, "system": key}
-            | summary([o for o in by_system[key] if o.group == group])
-            for group in groups
-            for key in systems
-        ]
-        + [{"group": "all", "title": "All gestures", "system": key} | summary(by_system[key]) for key in systems],
-        "by_gesture": [
-            {"gesture": label, "system": key} | summary([o for o in by_system[key] if o.gesture == label])
-            for label in labels
-            for key in systems
-        ],
-        "confusions": [c for key in systems for c in confusions(by_system[key])],
-        "between": [{"system": key} | _strays(between[key]) for key in systems],
-        "outcomes": [o.to_dict() for o in outcomes],
-    }
+
+    trials: int
+    activated: int
+    activation: float | None
+    already: int
+    reaction_s: Mapping[str, float | None]
+    within_200_ms: int
+    quick: float | None
+    named: int
+    gesture_activation: float | None
+    gesture_s: Mapping[str, float | None]
+    likelihood: float | None
+    gentle: int
+    called_negative: int
+    negative: float | None
+    called: Mapping[str, int]
+    from_gate: int
 
 
-def summary(outcomes: Sequence[TrialOutcome]) -> dict[str, Any]:
-    """Summarise the trials of one system: shares are of all ``trials``, times only of those that were answered.
-
-    ``called`` counts the values of `TrialOutcome.judged`.
-    """
+def summary(outcomes: Sequence[TrialOutcome]) -> TrialSummary:
+    """Summarise the trials of one system."""
     n = len(outcomes)
     reactions = sorted(o.reaction_s for o in outcomes if o.reaction_s is not None)
     named = sorted(o.gesture_s for o in outcomes if o.gesture_s is not None)
     likely = [o.likelihood for o in outcomes if o.likelihood is not None]
     quick = sum(r <= QUICK_S for r in reactions)
     gentle = [o for o in outcomes if o.affect != "negative"]
-    return {
-        "trials": n,
-        "activated": len(reactions),
-        "activation": _share(len(reactions), n),
-        "already": sum(o.already and o.reaction_s is None for o in outcomes),
-        "reaction_s": _times(reactions),
-        "within_200_ms": quick,
-        "quick": _share(quick, n),
-        "named": len(named),
-        "gesture_activation": _share(len(named), n),
-        "gesture_s": _times(named),
-        "likelihood": round(mean(likely), 4) if likely else None,
-        "gentle": len(gentle),
-        "called_negative": sum(o.negative for o in gentle),
-        "negative": _share(sum(o.negative for o in gentle), len(gentle)),
-        "called": {word: sum(o.judged == word for o in outcomes) for word in JUDGED},
-        "from_gate": sum(o.source == "gate" for o in outcomes),
-    }
+    return TrialSummary(
+        trials=n,
+        activated=len(reactions),
+        activation=_share(len(reactions), n),
+        already=sum(o.already and o.reaction_s is None for o in outcomes),
+        reaction_s=_times(reactions),
+        within_200_ms=quick,
+        quick=_share(quick, n),
+        named=len(named),
+        gesture_activation=_share(len(named), n),
+        gesture_s=_times(named),
+        likelihood=round(mean(likely), 4) if likely else None,
+        gentle=len(gentle),
+        called_negative=sum(o.negative for o in gentle),
+        negative=_share(sum(o.negative for o in gentle), len(gentle)),
+        called={word: sum(o.judged == word for o in outcomes) for word in JUDGED},
+        from_gate=sum(o.source == "gate" for o in outcomes),
+    )
 
 
 def _share(part: int, of: int) -> float | None:
@@ -392,77 +356,250 @@ def _times(values: Sequence[float]) -> dict[str, float | None]:
     return {name: None if value is None else round(value, 3) for name, value in latency_summary(values).items()}
 
 
-def confusions(outcomes: Sequence[TrialOutcome]) -> list[dict[str, Any]]:
-    """Count for each true family the recognised families (None: not named), the most frequent first."""
-    counts: dict[tuple[str, str | None], int] = {}
-    for o in outcomes:
-        counts[o.family, o.called_family] = counts.get((o.family, o.called_family), 0) + 1
-    order = list(dict.fromkeys(o.family for o in outcomes))
-    totals = {family: sum(n for (did, _), n in counts.items() if did == family) for family in order}
+@dataclass(frozen=True)
+class SummaryRow:
+    """The figures of one system: of a ``group`` of gestures ("all": of all), or of one ``gesture``."""
+
+    group: str
+    title: str
+    gesture: str | None
+    system: str
+    figures: TrialSummary
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, the figures beside what they are of."""
+        of = {"group": self.group, "title": self.title} if self.gesture is None else {"gesture": self.gesture}
+        return {**of, "system": self.system, **vars(self.figures)}
+
+
+@dataclass(frozen=True)
+class FamilyConfusion:
+    """How many trials of a true family (``did``) were recognised as another (``called``; None: not named)."""
+
+    system: str
+    did: str
+    called: str | None
+    trials: int
+    share: float | None
+
+
+def confusions(outcomes: Sequence[TrialOutcome]) -> list[FamilyConfusion]:
+    """Count for each true family the recognised families, the most frequent first."""
+    counts = Counter((o.family, o.called_family) for o in outcomes)
+    totals = Counter(o.family for o in outcomes)
+    order = list(totals)
     return [
-        {"system": outcomes[0].system, "did": did, "called": called, "trials": n, "share": _share(n, totals[did])}
+        FamilyConfusion(outcomes[0].system, did, called, n, _share(n, totals[did]))
         for (did, called), n in sorted(counts.items(), key=lambda item: (order.index(item[0][0]), -item[1]))
     ]
 
 
-def _strays(between: Sequence[Between]) -> dict[str, Any]:
-    """Return the events between the trials, summed over all streams; all but neutral events are reactions."""
-    hours = sum(b.hours for b in between)
-    counts = {name: sum(getattr(b, name) for b in between) for name in ("positive", "neutral", "negative", "none")}
-    reactions = counts["positive"] + counts["negative"] + counts["none"]
-    return {
-        "hours": round(hours, 4),
-        **counts,
-        "reactions_per_hour": round(reactions / hours, 2) if hours else None,
-        "negative_per_hour": round(counts["negative"] / hours, 2) if hours else None,
-    }
+@dataclass(frozen=True)
+class StrayEvents:
+    """Events of a system between the trials, in all streams; all but neutral ones are reactions."""
+
+    system: str
+    hours: float
+    positive: int
+    neutral: int
+    negative: int
+    none: int
+    reactions_per_hour: float | None
+    negative_per_hour: float | None
+
+    @classmethod
+    def summed(cls, system: str, between: Sequence[Between]) -> StrayEvents:
+        hours = sum(b.hours for b in between)
+        counts = {name: sum(getattr(b, name) for b in between) for name in ("positive", "neutral", "negative", "none")}
+        reactions = counts["positive"] + counts["negative"] + counts["none"]
+        rates = [round(n / hours, 2) if hours else None for n in (reactions, counts["negative"])]
+        return cls(system, round(hours, 4), **counts, reactions_per_hour=rates[0], negative_per_hour=rates[1])
 
 
-def aims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return this project's aims for the protocol with the measured values.
+@dataclass(frozen=True)
+class ScoredTrials:
+    """The outcome of every trial by each system, and what follows from them.
 
-    Each has ``aim``, ``measured`` (a share or seconds, see ``unit``), ``part`` and ``of``, the counts of a share, and
-    ``met``, which is None where there is no trial to measure it on.
+    ``rows`` are of each group and of all trials; ``between`` are the events outside all trials.
     """
-    outcomes = result["outcomes"]
 
-    def of(system: str, **accepted: Any) -> list[dict[str, Any]]:
-        return [o for o in outcomes if o["system"] == system and all(o[k] in v for k, v in accepted.items())]
+    people: tuple[str, ...]
+    trials: int
+    gestures: int
+    systems: tuple[str, ...]
+    rows: tuple[SummaryRow, ...]
+    by_gesture: tuple[SummaryRow, ...]
+    confusions: tuple[FamilyConfusion, ...]
+    between: tuple[StrayEvents, ...]
+    outcomes: tuple[TrialOutcome, ...]
 
-    blows = of("hybrid", group=("energetic",))
-    kind = of("hybrid", affect=("positive", "neutral"))
-    answered = [o["reaction_s"] for o in kind if o["reaction_s"] is not None]
-    fine = of("rules", group=("fine",))
-    quick = sum(o["reaction_s"] is not None and o["reaction_s"] <= QUICK_S for o in blows)
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "people": list(self.people),
+            "trials": self.trials,
+            "gestures": self.gestures,
+            "systems": [{"system": key, "title": SYSTEMS[key]} for key in self.systems],
+            "rows": [row.to_json() for row in self.rows],
+            "by_gesture": [row.to_json() for row in self.by_gesture],
+            "confusions": [dict(vars(row)) for row in self.confusions],
+            "between": [dict(vars(row)) for row in self.between],
+            "outcomes": [dict(vars(outcome)) for outcome in self.outcomes],
+        }
+
+
+@dataclass(frozen=True)
+class _SittingWork:
+    """The work on one sitting: run every system on it, and score its trials."""
+
+    model: Bundle | IntegerModel
+    baseline: RuleBaseline | None
+
+    def __call__(self, gestures: GestureSet, task: Sitting | VirtualSitting, report: Report, /) -> Result:
+        sitting = task.play()
+        outputs = system_outputs(sitting.frames, self.model, self.baseline)
+        if sitting.reactions is not None:
+            outputs["toy"] = noted_output(sitting.reactions)
+        scored = {system: score(sitting, system, output, gestures) for system, output in outputs.items()}
+        return {
+            "outcomes": [asdict(outcome) for outcomes, _ in scored.values() for outcome in outcomes],
+            "between": {system: asdict(between) for system, (_, between) in scored.items()},
+        }
+
+
+def score_sittings(
+    sittings: Sequence[Sitting | VirtualSitting],
+    model: Bundle | IntegerModel,
+    baseline: RuleBaseline | None = None,
+    progress: Progress | None = None,
+) -> ScoredTrials:
+    """Run every system on every sitting, and summarise the outcomes."""
+    labels = model.gestures.labels
+
+    def summarise(study: StudyResults) -> ScoredTrials:
+        outcomes = [TrialOutcome(**row) for result in study.results for row in result["outcomes"]]
+        between: dict[str, list[Between]] = {}
+        for result in study.results:
+            for system, stray in result["between"].items():
+                between.setdefault(system, []).append(Between(**stray))
+        systems = tuple(key for key in SYSTEMS if key in between)
+        by_system = {key: [o for o in outcomes if o.system == key] for key in systems}
+        groups = [g for g in GROUPS if any(o.group == g for o in outcomes)]
+        made = [label for label in labels if any(o.gesture == label for o in outcomes)]
+        rows = [
+            SummaryRow(g, GROUPS[g].title, None, key, summary([o for o in by_system[key] if o.group == g]))
+            for g in groups
+            for key in systems
+        ]
+        rows += [SummaryRow("all", "All gestures", None, key, summary(by_system[key])) for key in systems]
+        by_gesture = [
+            SummaryRow("", "", label, key, summary([o for o in by_system[key] if o.gesture == label]))
+            for label in made
+            for key in systems
+        ]
+        return ScoredTrials(
+            tuple(sitting.who for sitting in sittings),
+            len(by_system[systems[0]]),
+            len(made),
+            systems,
+            tuple(rows),
+            tuple(by_gesture),
+            tuple(c for key in systems for c in confusions(by_system[key])),
+            tuple(StrayEvents.summed(key, between[key]) for key in systems),
+            tuple(outcomes),
+        )
+
+    parts = [StudyPart(sitting.who, {"sitting": n}, sitting) for n, sitting in enumerate(sittings)]
+    work = _SittingWork(model, baseline)
+    return run_study(parts, work, summarise, key={}, shared=model.gestures, progress=progress)
+
+
+@dataclass(frozen=True)
+class Aim:
+    """An aim of this project with what was measured: a share or seconds (``unit``).
+
+    ``part`` and ``of`` are the counts of a share; ``met`` is None where there is no trial to measure it on.
+    """
+
+    aim: str
+    measured: float | None
+    unit: str
+    part: int | None
+    of: int
+    met: bool | None
+
+    @classmethod
+    def share(cls, words: str, part: int, of: int, line: float, *, most: bool = False) -> Aim:
+        """Return an aim for a share: at least, or at most, ``line``."""
+        share = part / of if of else None
+        met = None if share is None else share <= line if most else share >= line
+        return cls(words, _share(part, of), "share", part, of, met)
+
+
+def aims(outcomes: Sequence[TrialOutcome]) -> list[Aim]:
+    """Return this project's aims for the protocol with the measured values."""
+    hybrid = [o for o in outcomes if o.system == "hybrid"]
+    blows = [o for o in hybrid if o.group == "energetic"]
+    kind = [o for o in hybrid if o.affect in ("positive", "neutral")]
+    answered = [o.reaction_s for o in kind if o.reaction_s is not None]
+    fine = [o for o in outcomes if o.system == "rules" and o.group == "fine"]
+    quick = sum(o.reaction_s is not None and o.reaction_s <= QUICK_S for o in blows)
     time_s = round(median(answered), 3) if answered else None
+    met = None if time_s is None else time_s < 1.5
+    negative = sum(o.negative for o in kind)
+    scratches = sum(o.reaction_s is not None for o in fine)
     return [
-        _aim("Hybrid: blows and pulls answered within 0.2 s in at least 98 % of the trials", quick, len(blows), 0.98),
-        _aim(
-            "Hybrid: gentle gestures called negative in at most 1 % of the trials",
-            sum(o["negative"] for o in kind),
-            len(kind),
-            0.01,
-            most=True,
+        Aim.share(
+            "Hybrid: blows and pulls answered within 0.2 s in at least 98 % of the trials", quick, len(blows), 0.98
         ),
-        {
-            "aim": "Hybrid: median reaction to gentle gestures under 1.5 s",
-            "measured": time_s,
-            "unit": "s",
-            "part": None,
-            "of": len(answered),
-            "met": None if time_s is None else time_s < 1.5,
-        },
-        _aim(
+        Aim.share(
+            "Hybrid: gentle gestures called negative in at most 1 % of the trials", negative, len(kind), 0.01, most=True
+        ),
+        Aim("Hybrid: median reaction to gentle gestures under 1.5 s", time_s, "s", None, len(answered), met),
+        Aim.share(
             "Rules only: fine scratches answered in at most 20 % of the trials (the paper: about 6 %)",
-            sum(o["reaction_s"] is not None for o in fine),
-            len(fine),
-            0.2,
+            *(scratches, len(fine), 0.2),
             most=True,
         ),
     ]
 
 
-def _aim(words: str, part: int, of: int, line: float, most: bool = False) -> dict[str, Any]:
-    share = part / of if of else None
-    met = None if share is None else share <= line if most else share >= line
-    return {"aim": words, "measured": _share(part, of), "unit": "share", "part": part, "of": of, "met": met}
+@dataclass(frozen=True)
+class ProtocolResult:
+    """The result of the protocol, as its page shows it.
+
+    Attributes:
+        simulated: whether the people or their toy were virtual.
+        left: people who were left out.
+        aims: only for virtual people.
+        counted: notes on how figures are counted.
+        said: notes on the limits of the figures.
+        about: rows (name, value) on people, network and settings.
+        files: what was written.
+    """
+
+    scored: ScoredTrials
+    heading: str
+    simulated: bool
+    left: tuple[LeftOut, ...]
+    aims: tuple[Aim, ...]
+    counted: tuple[str, ...]
+    said: tuple[str, ...]
+    about: tuple[tuple[str, str], ...]
+    engine: str
+    files: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            **self.scored.to_json(),
+            "heading": self.heading,
+            "simulated": self.simulated,
+            "left": [dict(vars(one)) for one in self.left],
+            "aims": [dict(vars(aim)) for aim in self.aims],
+            "counted": list(self.counted),
+            "said": list(self.said),
+            "about": [list(row) for row in self.about],
+            "engine": self.engine,
+            **({"files": list(self.files)} if self.files else {}),
+        }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,8 +25,6 @@ FIRST_STRANGER = 1001
 _SESSION = 46  # no other use of the virtual toy has this session number
 _IDLE_S = (1.0, 3.0)
 _VIRTUAL_CODE = re.compile(r"P0*(\d{1,9})")
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -55,6 +53,18 @@ class Sitting:
     frames: Frames
     trials: tuple[GestureTrial, ...]
     reactions: tuple[tuple[float, str], ...] | None = None
+
+    def play(self) -> Sitting:
+        """Return this sitting; one of a virtual person is played first."""
+        return self
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A person who was left out, and why."""
+
+    who: str
+    why: str
 
 
 def virtual_numbers(people: int, first: int, provenance: Mapping[str, Any]) -> list[int]:
@@ -89,11 +99,8 @@ def virtual_sittings(
     *,
     gestures: Sequence[str] = GESTURES,
     world: World = WORLD,
-) -> Iterator[Sitting]:
-    """Play the paper's protocol with virtual people: 17 gestures, each ``repetitions`` times in a row.
-
-    Between two gestures the toy stands idle, is picked up and turned without a gesture, and stands idle again.
-    Between two repetitions the person waits for the recorder's countdown.
+) -> list[VirtualSitting]:
+    """Return the paper's protocol for each virtual person: 17 gestures, each ``repetitions`` times in a row.
 
     Raises:
         ConfigError: for a number out of range, or a layout that the virtual toy does not support.
@@ -101,23 +108,43 @@ def virtual_sittings(
     for name, value, low, high in (("repetitions", repetitions, 1, 100), ("seed", seed, 0, 2**31)):
         if not low <= value <= high:
             raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
-    return _play(numbers, seed, repetitions, channel_columns(layout), gestures, world)
+    columns = tuple(channel_columns(layout))
+    return [VirtualSitting(number, seed, repetitions, columns, tuple(gestures), world) for number in numbers]
 
 
-def _play(
-    numbers: Sequence[int], seed: int, repetitions: int, columns: list[int], gestures: Sequence[str], world: World
-) -> Iterator[Sitting]:
-    for number in numbers:
+@dataclass(frozen=True)
+class VirtualSitting:
+    """A session of one virtual person, which is played when it is scored.
+
+    Between two gestures the toy stands idle, is picked up and turned without a gesture, and stands idle again.
+    Between two repetitions the person waits for the recorder's countdown.
+    """
+
+    number: int
+    seed: int
+    repetitions: int
+    columns: tuple[int, ...]
+    gestures: tuple[str, ...]
+    world: World
+
+    @property
+    def who(self) -> str:
+        """Name of the person."""
+        return f"virtual {self.number}"
+
+    def play(self) -> Sitting:
+        """Return the session of this person."""
+        number, seed, repetitions, world = self.number, self.seed, self.repetitions, self.world
         session = VirtualSession(draw_person(number, seed, world), seed, _SESSION, world)
         rng = np.random.default_rng([seed, number, _SESSION])
         episodes = [session.idle(4.0)]
-        for label in gestures:
+        for label in self.gestures:
             episodes.append(session.handle())
             episodes.append(session.idle(float(rng.uniform(*_IDLE_S))))
             episodes.append(session.perform(label, repetitions))
             episodes.append(session.idle(float(rng.uniform(*_IDLE_S))))
         device_ms = np.concatenate([e.device_ms for e in episodes])
-        values = np.concatenate([e.values for e in episodes])[:, columns]
+        values = np.concatenate([e.values for e in episodes])[:, list(self.columns)]
         received = rng.random(len(values)) >= world.lost + world.garbled
         frames = Frames(values[received], device_ms[received])
         first_ms = int(frames.device_ms[0])
@@ -129,7 +156,7 @@ def _play(
                 for sample in (mark.start, onset, mark.stop)
             )
             trials.append(GestureTrial(mark.label, n % repetitions + 1, start_s, onset_s, stop_s))
-        yield Sitting(f"virtual {number}", frames, tuple(trials))
+        return Sitting(self.who, frames, tuple(trials))
 
 
 def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: Mapping[str, Any]) -> list[str]:
@@ -163,23 +190,23 @@ def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: M
 
 def recorded_sittings(
     dataset: Dataset, people: Sequence[str], gestures: GestureSet
-) -> tuple[list[Sitting], list[dict[str, str]]]:
+) -> tuple[list[Sitting], list[LeftOut]]:
     """Return each person's streams with the recordings of ``gestures`` in them as trials, onset at the start mark.
 
     Recordings at rest are not trials. A person with several streams has a sitting for each.
 
     Returns:
-        the sittings, and the people left out (``who``) because no stream of theirs has such a recording (``why``).
+        the sittings, and the people left out because no stream of theirs has such a recording.
 
     Raises:
         DatasetError: when nobody is left.
     """
     sittings: list[Sitting] = []
-    left: list[dict[str, str]] = []
+    left: list[LeftOut] = []
     for who in people:
         streams = [s for s in dataset.streams if s.subject == who]
         if not streams:
-            left.append({"who": who, "why": "has no session stream, only single recordings"})
+            left.append(LeftOut(who, "has no session stream, only single recordings"))
             continue
         trials_made = 0
         for stream in streams:
@@ -203,9 +230,9 @@ def recorded_sittings(
             name = who if len(streams) == 1 else f"{who}, {stream.session}"
             sittings.append(Sitting(name, frames, tuple(trials)))
         if not trials_made:
-            left.append({"who": who, "why": "has a session stream, but none of the recordings was found in it"})
+            left.append(LeftOut(who, "has a session stream, but none of the recordings was found in it"))
     if not sittings:
-        why = f" ('{left[0]['who']}' {left[0]['why']})" if left else ""
+        why = f" ('{left[0].who}' {left[0].why})" if left else ""
         raise DatasetError(
             f"Nobody in '{dataset.head.name}' has a session stream with recordings in it{why}: the protocol needs "
             "fulldatastream.csv beside the recordings, from the recorder or from  plushsense record."

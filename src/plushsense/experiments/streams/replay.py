@@ -20,7 +20,8 @@ from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import AFFECTS, NO_GESTURE
 from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.trace import ReportedEvent, TraceReplayer, trace_of
+from plushsense.runtime.replay import TraceReplayer
+from plushsense.runtime.trace import ReportedEvent, trace_of
 from plushsense.scoring.events import (
     LATE_S,
     UNNAMED,

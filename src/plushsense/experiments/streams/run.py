@@ -29,12 +29,19 @@ from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
-from plushsense.dataset.store import HEAD, Dataset
+from plushsense.dataset.store import HEAD, Dataset, StreamInfo
 from plushsense.deploy.quantize import calibration
-from plushsense.experiments.streams.predictions import check_events_path, read_predictions, shortened, write_events
+from plushsense.experiments.streams.predictions import (
+    StreamPredictions,
+    check_events_path,
+    read_predictions,
+    shortened,
+    write_events,
+)
 from plushsense.experiments.streams.replay import (
     EventCounts,
-    StreamEvents,
+    StreamScore,
+    StreamTruth,
     count_matches,
     model_events,
     people_scores,
@@ -43,7 +50,6 @@ from plushsense.experiments.streams.replay import (
     truth_of,
 )
 from plushsense.experiments.streams.score import (
-    EpochReport,
     Fitted,
     PeopleFold,
     Settings,
@@ -60,7 +66,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle, known_people, trained_people
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.events import LATE_S
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochProgress, TrainSpec
 from plushsense.tuning.gate import GateSpec, fit_gate
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
@@ -109,14 +115,14 @@ class TrainStreams:
     gate: bool
     folder: Path
 
-    def __call__(self, dataset: Dataset, fold: PeopleFold, progress: EpochReport, /) -> Fitted:
+    def __call__(self, dataset: Dataset, fold: PeopleFold, progress: EpochProgress, /) -> Fitted:
         networks = {name: self._network(recipe, dataset, fold, progress) for name, recipe in self.recipes.items()}
         if not self.gate:
             return Fitted(networks)
         fitted = fit_gate(dataset, next(iter(networks.values())).gestures, fold.train)
         return Fitted(networks, fitted.settings, {"gate": fitted.report, "plan": asdict(fitted.settings)})
 
-    def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochReport) -> Bundle:
+    def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochProgress) -> Bundle:
         path = self.folder / f"{job_id({**recipe.key(), 'data': dataset.hash, 'fold': vars(fold)})}.plush"
         if path.is_file():
             return Bundle.load(path)
@@ -256,6 +262,96 @@ def _people_of(dataset: Dataset, path: str | os.PathLike[str], subjects: Sequenc
     return there
 
 
+@dataclass(frozen=True)
+class ScoredStreams:
+    """The scores of the events of one system on whole streams.
+
+    Attributes:
+        scores: of each person.
+        note: how to read the false events.
+        labelled_stretches: number of labels between recordings that were used.
+    """
+
+    scores: Mapping[str, StreamScore]
+    dataset: str
+    simulated: bool
+    late_s: float
+    labelled_stretches: int
+    note: str
+
+    @property
+    def whole(self) -> StreamScore:
+        """The scores of all people together."""
+        return pooled_scores(self.scores.values())
+
+
+@dataclass(frozen=True)
+class StreamEvalResult(ScoredStreams):
+    """The result of `stream_eval`; ``trained_on`` names scored people on whom the model was trained."""
+
+    trained_on: tuple[str, ...]
+    spec: DecideSpec
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values: the figures over all people, and ``people`` with those of each."""
+        rows = {who: {**one.to_dict(), "trained_on": who in self.trained_on} for who, one in self.scores.items()}
+        settings = {k: v for k, v in self.spec.to_dict().items() if k not in ("gate", "health", "fitted")}
+        return {
+            **self.whole.to_dict(),
+            "people": rows,
+            "dataset": self.dataset,
+            "simulated": self.simulated,
+            "trained_on": list(self.trained_on),
+            "settings": settings,
+            "gate_rules": len(self.spec.gate.rules),
+            "late_s": self.late_s,
+            "labelled_stretches": self.labelled_stretches,
+            "note": self.note,
+        }
+
+
+@dataclass(frozen=True)
+class ThresholdPoint:
+    """Recall, F1 and false events per hour of the predictions whose score is at least ``threshold``."""
+
+    threshold: float
+    recall: float
+    f1: float
+    false_events_per_hour: float
+
+
+@dataclass(frozen=True)
+class PredictionsResult(ScoredStreams):
+    """The result of `score_predictions`; ``form`` is "events" or "decisions"."""
+
+    curve: tuple[ThresholdPoint, ...]
+    predictions: str
+    form: str
+    threshold: float
+    classes: tuple[str, ...]
+    streams: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values: the figures over all people, and ``people`` with those of each."""
+        table: dict[str, Any] = {**self.whole.to_dict(), "people": {p: one.to_dict() for p, one in self.scores.items()}}
+        for row in (table, *table["people"].values()):
+            del row["gate_events"]  # predictions do not say what began an event
+        return {
+            **table,
+            "curve": [dict(vars(point)) for point in self.curve],
+            "dataset": self.dataset,
+            "simulated": self.simulated,
+            "predictions": self.predictions,
+            "form": self.form,
+            "threshold": self.threshold,
+            "classes": list(self.classes),
+            "streams": list(self.streams),
+            "late_s": self.late_s,
+            "labelled_stretches": self.labelled_stretches,
+            "note": self.note,
+        }
+
+
 def stream_eval(
     path: str | os.PathLike[str],
     model: Bundle | str | os.PathLike[str],
@@ -265,7 +361,7 @@ def stream_eval(
     events: str | os.PathLike[str] | None = None,
     labels: bool = True,
     warn: Warn = python_warning,
-) -> dict[str, Any]:
+) -> StreamEvalResult:
     """Replay whole streams through one bundle with its own decision settings, and score its events.
 
     Args:
@@ -276,10 +372,6 @@ def stream_eval(
         events: a CSV file to write the events to, which `score_predictions` reads.
         labels: whether to use the labels of stretches between recordings (`Dataset.stretches`).
         warn: called with a sentence on the people who are left out or were trained on.
-
-    Returns:
-        the figures of `replay.StreamScore` over all people (``events``, ``hits``, ``deletions``, ``insertions``,
-        ``false_events_per_hour``, ``latency_s``, ``per_class`` and more), ``people`` and ``trained_on``.
 
     Raises:
         DatasetError: where no stream has a recording in it; BundleError: where the model has other inputs.
@@ -296,47 +388,50 @@ def stream_eval(
                 f"The model reads {', '.join(bundle.layout.inputs)}, and '{dataset.head.name}' has "
                 f"{', '.join(dataset.layout.inputs)}: give streams of the same sensors."
             )
-        there = _people_of(dataset, path, subjects)
-        trained = trained_people(bundle, dataset)
-        wanted = list(there) if subjects is None else list(dict.fromkeys(subjects))
-        if subjects is None:
-            wanted = [p for p in there if p not in trained]
-            left_out = [p for p in there if p in trained]
-            if left_out:
-                warn(f"left out, since the model was TRAINED ON them: {', '.join(left_out)}")
-            if not wanted:
-                raise BadInput(
-                    "The model was trained on everybody who has a stream here, so the scores would be too high: use "
-                    "--split by-subject:5, or name people with --subjects to score them anyway."
-                )
-        met = [p for p in wanted if p in trained]
-        if met:
-            warn(f"TRAINED ON: the model was trained on {', '.join(met)}; their scores are too high and are no result")
-        if alike := [p for p in wanted if p not in trained and p in known_people(bundle.provenance)]:
-            warn(
-                f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset', '?')}': if "
-                f"{', '.join(alike)} are the same people, their scores are too high"
-            )
-        if not known_people(bundle.provenance):
-            warn("the bundle does not say on whom it was trained: if on these people, the scores are too high")
+        people, met = _scored_people(_people_of(dataset, path, subjects), subjects, bundle, dataset, warn)
         spec = DecideSpec.from_dict(bundle.decision)
-        found = list(model_events(dataset, bundle, wanted, spec))
+        found = list(model_events(dataset, bundle, people, spec))
         if events is not None:
             write_events(events, found, bundle.gestures)
-        table = pooled_scores(people_scores(found, bundle.gestures, late_s=late_s))
-        for person, row in table["people"].items():
-            row["trained_on"] = person in met
-        return {
-            **table,
-            "dataset": dataset.head.name,
-            "simulated": dataset.head.simulated,
-            "trained_on": met,
-            "settings": {k: v for k, v in spec.to_dict().items() if k not in ("gate", "health", "fitted")},
-            "gate_rules": len(spec.gate.rules),
-            "late_s": late_s,
-            "labelled_stretches": len(dataset.stretches),
-            "note": describe_false_events(dataset),
-        }
+        return StreamEvalResult(
+            people_scores(found, bundle.gestures, late_s=late_s),
+            dataset.head.name,
+            dataset.head.simulated,
+            late_s,
+            len(dataset.stretches),
+            describe_false_events(dataset),
+            tuple(met),
+            spec,
+        )
+
+
+def _scored_people(
+    there: Sequence[str], subjects: Sequence[str] | None, bundle: Bundle, dataset: Dataset, warn: Warn
+) -> tuple[list[str], list[str]]:
+    """Return the people to score, and those of them on whom the model was trained; warn of what limits the scores."""
+    trained = trained_people(bundle, dataset)
+    people = [p for p in there if p not in trained] if subjects is None else list(dict.fromkeys(subjects))
+    if subjects is None:
+        left_out = [p for p in there if p in trained]
+        if left_out:
+            warn(f"left out, since the model was TRAINED ON them: {', '.join(left_out)}")
+        if not people:
+            raise BadInput(
+                "The model was trained on everybody who has a stream here, so the scores would be too high: use "
+                "--split by-subject:5, or name people with --subjects to score them anyway."
+            )
+    met = [p for p in people if p in trained]
+    if met:
+        warn(f"TRAINED ON: the model was trained on {', '.join(met)}; their scores are too high and are no result")
+    known = known_people(bundle.provenance)
+    if alike := [p for p in people if p not in trained and p in known]:
+        warn(
+            f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset', '?')}': if "
+            f"{', '.join(alike)} are the same people, their scores are too high"
+        )
+    if not known:
+        warn("the bundle does not say on whom it was trained: if on these people, the scores are too high")
+    return people, met
 
 
 def score_predictions(
@@ -349,7 +444,7 @@ def score_predictions(
     late_s: float = LATE_S,
     labels: bool = True,
     warn: Warn = python_warning,
-) -> dict[str, Any]:
+) -> PredictionsResult:
     """Score the predictions of any system against the true gestures of whole streams.
 
     Args:
@@ -364,8 +459,7 @@ def score_predictions(
         warn: called with a sentence on streams and gestures that are left out.
 
     Returns:
-        the figures of `stream_eval`, except those on the model; and ``curve``: recall, F1 and false events per hour at
-        up to 21 thresholds, if the file has scores.
+        the scores, with a ``curve`` of up to 21 thresholds if the file has scores.
 
     Raises:
         FileFormatError: for a file that cannot be used, with the line; DatasetError: where no stream has a recording
@@ -377,58 +471,86 @@ def score_predictions(
         dataset, classes = named_classes(dataset if labels else dataset.without_stretches(), classes)
         gestures = choose_classes(dataset, classes, warn)
         there = scored_streams(dataset, _people_of(dataset, path, subjects))
-        wanted = [s for s in there if subjects is None or s.subject in subjects]
-        alone = wanted[0].id if len(wanted) == 1 else None
+        asked = [s for s in there if subjects is None or s.subject in subjects]
+        alone = asked[0].id if len(asked) == 1 else None
         read = read_predictions(predictions, gestures, dataset.gestures, there, alone)
         if threshold > 0 and not read.scored:
             raise FileFormatError(f"'{predictions}' has no column 'score': add one, or give no threshold.")
         if subjects is None:
-            if left_out := [s.id for s in wanted if s.id not in read.rows]:
-                warn(
-                    f"not scored, as '{predictions}' has no row of them: {shortened(left_out)}; for a stream without "
-                    "events give one row with an empty label, or name the people with --subjects"
-                )
-            wanted = [s for s in wanted if s.id in read.rows]
-        truths = [truth_of(dataset, s, dataset.read_stream(s.id), gestures) for s in wanted]
+            asked = _named_in(read, asked, f"'{predictions}'", warn)
+        truths = [truth_of(dataset, s, dataset.read_stream(s.id), gestures) for s in asked]
         read.check_ends(truths)
-        found: list[StreamEvents] = [(truth, read.events(truth.stream, threshold)) for truth in truths]
-        curve = []
-        for value in read.thresholds():
-            counts = EventCounts()
-            for truth in truths:
-                counts.add(count_matches(truth, read.events(truth.stream, value), gestures, late_s))
-            shares = {"recall": counts.recall, "f1": counts.f1, "false_events_per_hour": counts.false_per_hour}
-            curve.append({"threshold": value, **shares})
-        table = pooled_scores(people_scores(found, gestures, late_s=late_s))
-        for row in (table, *table["people"].values()):
-            del row["gate_events"]  # predictions do not say what began an event
-        return {
-            **table,
-            "curve": curve,
-            "dataset": dataset.head.name,
-            "simulated": dataset.head.simulated,
-            "predictions": str(predictions),
-            "form": "events" if read.are_events else "decisions",
-            "threshold": threshold,
-            "classes": list(gestures.labels),
-            "streams": [truth.stream for truth in truths],
-            "late_s": late_s,
-            "labelled_stretches": len(dataset.stretches),
-            "note": f"{describe_false_events(dataset)} {_UNKNOWN_TRAINING}",
-        }
+        return PredictionsResult(
+            people_scores([(t, read.events(t.stream, threshold)) for t in truths], gestures, late_s=late_s),
+            dataset.head.name,
+            dataset.head.simulated,
+            late_s,
+            len(dataset.stretches),
+            f"{describe_false_events(dataset)} {_UNKNOWN_TRAINING}",
+            _threshold_curve(read, truths, gestures, late_s),
+            str(predictions),
+            "events" if read.are_events else "decisions",
+            threshold,
+            tuple(gestures.labels),
+            tuple(truth.stream for truth in truths),
+        )
+
+
+def _named_in(read: StreamPredictions, streams: Sequence[StreamInfo], file: str, warn: Warn) -> list[StreamInfo]:
+    """Return the streams that a file of predictions names, and warn of the others."""
+    if left_out := [s.id for s in streams if s.id not in read.rows]:
+        warn(
+            f"not scored, as {file} has no row of them: {shortened(left_out)}; for a stream without events give one "
+            "row with an empty label, or name the people with --subjects"
+        )
+    return [s for s in streams if s.id in read.rows]
+
+
+def _threshold_curve(
+    read: StreamPredictions, truths: Sequence[StreamTruth], gestures: GestureSet, late_s: float
+) -> tuple[ThresholdPoint, ...]:
+    curve = []
+    for value in read.thresholds():
+        counts = EventCounts()
+        for truth in truths:
+            counts.add(count_matches(truth, read.events(truth.stream, value), gestures, late_s))
+        curve.append(ThresholdPoint(value, counts.recall, counts.f1, counts.false_per_hour))
+    return tuple(curve)
+
+
+@dataclass(frozen=True)
+class BenchmarkSpec:
+    """What the continuous benchmark compares.
+
+    Attributes:
+        split: "by-subject:5" or "leave-one-subject-out".
+        systems: names of `plushsense.experiments.streams.systems.SYSTEMS`; by default all.
+        late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
+        labels: whether to train and score with the labels of stretches between recordings (`Dataset.stretches`).
+        anywhere_pool_s: pooling time in seconds of the networks of stream training (default: that of the others).
+    """
+
+    split: str = SPLIT
+    systems: Sequence[str] | None = None
+    late_s: float = LATE_S
+    labels: bool = True
+    anywhere_pool_s: float | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The systems in the order of `SYSTEMS`."""
+        for name in self.systems or ():
+            check_known(name, SYSTEMS, "system", ConfigError)
+        return tuple(name for name in SYSTEMS if self.systems is None or name in self.systems)
 
 
 def stream_benchmark(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
+    spec: BenchmarkSpec | None = None,
     *,
-    split: str = SPLIT,
-    systems: Sequence[str] | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
-    late_s: float = LATE_S,
-    labels: bool = True,
-    anywhere_pool_s: float | None = None,
     progress: Progress | None = None,
     warn: Warn = python_warning,
     **settings: Any,
@@ -440,52 +562,41 @@ def stream_benchmark(
 
     Args:
         config, settings, warn: as for `train`; also ``workers``.
-        split: "by-subject:5" or "leave-one-subject-out".
-        systems: names of `plushsense.experiments.streams.systems.SYSTEMS`; by default all.
         out: a folder for the table as JSON and CSV, a page, and its figures.
-        late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
-        labels: whether to train and score with the labels of stretches between recordings (`Dataset.stretches`).
-        anywhere_pool_s: pooling time in seconds of the networks of stream training (default: that of the others).
 
     Returns:
         what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note`` and the settings.
     """
+    spec = spec or BenchmarkSpec()
     run = prepare(dataset, config or from_settings(**settings))
-    dataset = run.dataset if labels else run.dataset.without_stretches()
-    names = _named(systems)
+    dataset = run.dataset if spec.labels else run.dataset.without_stretches()
+    names, seed = spec.names, run.evaluation.seed
     if out is not None:
         need("matplotlib", extra="reports")
         need("jinja2", extra="reports")
         check_results(Path(out), "A benchmark", TABLE, replace=overwrite)
-    people_folds(dataset, split, run.evaluation.seed)  # raises before anything is trained
-    recipes = recipes_for(dataset, run, {SYSTEMS[n].network for n in names}, anywhere_pool_s, warn)
-    networks = dataset.path / CACHE / "stream-networks"
-    fit = TrainStreams(recipes, any(SYSTEMS[n].gate_to for n in names), networks)
+    people_folds(dataset, spec.split, seed)  # raises before anything is trained
+    recipes = recipes_for(dataset, run, {SYSTEMS[n].network for n in names}, spec.anywhere_pool_s, warn)
+    fit = TrainStreams(recipes, any(SYSTEMS[n].gate_to for n in names), dataset.path / CACHE / "stream-networks")
     folds = crossvalidated_streams(
         dataset,
-        split,
+        spec.split,
         fit,
-        settings=Settings(names, late_s=late_s),
+        settings=Settings(names, late_s=spec.late_s),
         spec=JobsSpec(run.evaluation.processes, journal=journal_of(dataset, "streams")),
         key=fit.key(),
-        seed=run.evaluation.seed,
+        seed=seed,
         progress=progress,
     )
+    tested = {person for fold in folds for person in fold["test"]}
     table = {
-        "split": split,
-        "dataset": dataset.head.name,
-        "dataset_hash": dataset.hash,
-        "simulated": dataset.head.simulated,
-        "labelled": dataset.layout.is_labelled,
-        "note": describe_false_events(dataset),
-        "late_s": late_s,
-        "labelled_stretches": len(dataset.stretches),
-        "subjects": sorted({person for fold in folds for person in fold["test"]} & set(people_with_streams(dataset))),
+        **_described(dataset, spec),
+        "subjects": sorted(tested & set(people_with_streams(dataset))),
         "code_version": __version__,
         **summed(folds),
-        "seed": run.evaluation.seed,
+        "seed": seed,
         "networks": {name: recipe.arch.title for name, recipe in recipes.items()},
-        "anywhere": {"pool_s": anywhere_pool_s, **vars(run.anywhere)},
+        "anywhere": {"pool_s": spec.anywhere_pool_s, **vars(run.anywhere)},
         "preset": run.preset,
         "training": run.training.to_dict(),
     }
@@ -495,12 +606,17 @@ def stream_benchmark(
     return table
 
 
-def _named(systems: Sequence[str] | None) -> tuple[str, ...]:
-    if systems is None:
-        return tuple(SYSTEMS)
-    for name in systems:
-        check_known(name, SYSTEMS, "system", ConfigError)
-    return tuple(name for name in SYSTEMS if name in systems)
+def _described(dataset: Dataset, spec: BenchmarkSpec) -> dict[str, Any]:
+    return {
+        "split": spec.split,
+        "dataset": dataset.head.name,
+        "dataset_hash": dataset.hash,
+        "simulated": dataset.head.simulated,
+        "labelled": dataset.layout.is_labelled,
+        "note": describe_false_events(dataset),
+        "late_s": spec.late_s,
+        "labelled_stretches": len(dataset.stretches),
+    }
 
 
 def save_benchmark(table: dict[str, Any], out: Path) -> None:

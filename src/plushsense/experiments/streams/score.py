@@ -7,7 +7,7 @@ PyTorch. The journal stores a finished fold as counts (some kilobytes), without 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -51,6 +51,7 @@ from plushsense.runtime.gate import GateSettings
 from plushsense.scoring.events import LATE_S, ErrorCosts, at_recall
 from plushsense.scoring.metrics import BOOTSTRAP_SEED, summary
 from plushsense.scoring.splits import make_folds, parse_split
+from plushsense.training.spec import EpochProgress, EpochRow
 
 # Part of every job's id: increase it when the meaning of a stored fold changes.
 _VERSION = 5
@@ -80,8 +81,7 @@ class Fitted:
     report: Mapping[str, Any] = field(default_factory=dict)
 
 
-EpochReport = Callable[[int, int, dict[str, Any]], None]
-FitStreams = Callable[[Dataset, PeopleFold, EpochReport], Fitted]
+FitStreams = Callable[[Dataset, PeopleFold, EpochProgress], Fitted]
 """A function that fits networks and gate to the training people of a fold; the validation people may stop it early.
 
 It must be picklable and deterministic, must not use the test people, and calls its last argument with (epoch, maximum
@@ -189,7 +189,7 @@ class _FoldWork:
     def __call__(self, shared: Any, task: PeopleFold, report: Report, /) -> Result:
         began = time.perf_counter()
 
-        def progress(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        def progress(epoch: int, epochs: int, row: EpochRow) -> None:
             report((epoch, epochs))
 
         fitted = self.fit(shared, task, progress)
@@ -365,8 +365,8 @@ def _outcome(folds: Folds, name: str, how: str) -> dict[str, Any]:
             level: [round(float(q), 3) for q in np.quantile(values, LATENCY_SHARES)] if values else []
             for level, values in latencies.items()
         },
-        "f1_people": summary([p["f1"] for p in people if p["f1"] is not None]),
-        "recall_people": summary([p["recall"] for p in people if p["recall"] is not None]),
+        "f1_people": summary([p["f1"] for p in people if p["f1"] is not None]).to_json(),
+        "recall_people": summary([p["recall"] for p in people if p["recall"] is not None]).to_json(),
         "people": sorted(people, key=lambda p: p["subject"]),
     }
 
@@ -399,9 +399,9 @@ def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]
     return rows
 
 
-def pooled_scores(scores: Mapping[str, StreamScore]) -> dict[str, Any]:
-    """Return the scores of all people together as one table, with a row for each person."""
+def pooled_scores(scores: Iterable[StreamScore]) -> StreamScore:
+    """Return the scores of all people together."""
     whole = StreamScore()
-    for mine in scores.values():
-        whole.add(mine)
-    return {**whole.to_dict(), "people": {person: mine.to_dict() for person, mine in scores.items()}}
+    for one in scores:
+        whole.add(one)
+    return whole

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plushsense.core.errors import need
-from plushsense.experiments.sweep.results import SweepResults, finite, name_of
+from plushsense.experiments.sweep.grid import CHOSEN, SECOND
+from plushsense.experiments.sweep.results import StoredSweep, finite, name_of
 from plushsense.experiments.sweep.tables import (
     COSTS,
-    acr_ranking,
+    ArchitectureScores,
     architectures,
     batches,
     effect,
@@ -23,9 +24,8 @@ from plushsense.experiments.sweep.tables import (
     top_rows,
 )
 from plushsense.reports import figures
-from plushsense.reports.table import Row, count
+from plushsense.reports.table import Row
 from plushsense.reports.wording import describe_runs
-from plushsense.trials.grid import CHOSEN, SECOND
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,7 +57,7 @@ NAMED = 14
 """Largest number of points of a Pareto front that are labelled."""
 
 
-def about(sweep: SweepResults) -> str:
+def about(sweep: StoredSweep) -> str:
     """Return the line below a figure: data set, split, number of runs, and whether it is leaky or simulated."""
     parts = [
         f"data: {sweep.head.get('dataset') or '?'}",
@@ -71,14 +71,14 @@ def about(sweep: SweepResults) -> str:
     return " · ".join(parts)
 
 
-def _figure(sweep: SweepResults, width: float, height: float, title: str) -> Figure:
+def _figure(sweep: StoredSweep, width: float, height: float, title: str) -> Figure:
     figure = figures.new_figure(width, height)
     figure.suptitle(title, fontsize=11, x=0.01, ha="left").set_parse_math(False)
     _describe_below(figure, sweep)
     return figure
 
 
-def _describe_below(figure: Figure, sweep: SweepResults) -> None:
+def _describe_below(figure: Figure, sweep: StoredSweep) -> None:
     warned = sweep.leaky or sweep.simulated
     colour, weight = ("#b3261e", "bold") if warned else ("#57606a", "normal")
     lines = textwrap.fill(about(sweep), round(_LETTERS_AN_INCH * figure.get_figwidth()), break_on_hyphens=False)
@@ -86,21 +86,21 @@ def _describe_below(figure: Figure, sweep: SweepResults) -> None:
     text.set_parse_math(False)
 
 
-def score_label(sweep: SweepResults, measure: str) -> str:
+def score_label(sweep: StoredSweep, measure: str) -> str:
     marks = ["leaky"] * sweep.leaky + ["simulation"] * sweep.simulated
     return f"{measure}{', ' + ', '.join(marks) if marks else ''}"
 
 
-def by_architecture(sweep: SweepResults) -> Figure:
+def by_architecture(sweep: StoredSweep) -> Figure:
     """Draw the paper's Figure 7: highest and mean accuracy of each architecture, and its size with the most filters."""
-    rows = _bars(architectures(sweep))
+    rows = _best(architectures(sweep))
     title = f"{LIKE.format(7)}: accuracy of each architecture, and its size"
     figure = _figure(sweep, 9.2, 1.9 + 0.42 * len(rows), title)
     axes = figure.add_subplot()
     _accuracy_bars(axes, rows, "epochs, batch and filters")
     axes.set_xlabel(score_label(sweep, "Accuracy (% of test windows)"), fontsize=9)
     top = axes.twiny()
-    sizes = [row["parameters"] / 1000 for row in rows]
+    sizes = [row.parameters / 1000 for row in rows]
     top.plot(sizes, np.arange(len(rows)) - 0.2, "D", color=SIZE, markeredgecolor="black", markersize=5.5)
     top.set_xlim(0, max(sizes) * 1.08)
     largest = sweep.filter_sets[-1].replace("/", " ")
@@ -111,18 +111,17 @@ def by_architecture(sweep: SweepResults) -> Figure:
     return figure
 
 
-def by_filters(sweep: SweepResults) -> Figure:
+def by_filters(sweep: StoredSweep) -> Figure:
     """Draw the paper's Figure 8: the bars of Figure 7 in one panel for each filter set, the largest set first."""
     sets = sweep.filter_sets[::-1]
-    names = [row["arch"] for row in _bars(architectures(sweep))]
+    names = [row.arch for row in _best(architectures(sweep))]
     rows_of_panels = -(-len(sets) // 2)
     title = f"{LIKE.format(8)}: accuracy of each architecture by filter set"
     figure = _figure(sweep, 9.6, 1.2 + rows_of_panels * (1.0 + 0.33 * len(names)), title)
     panels = figure.subplots(rows_of_panels, 2, sharex=True, squeeze=False).flatten()
     for i, (axes, filter_set) in enumerate(zip(panels, sets, strict=False)):
-        by_name = {row["arch"]: row for row in architectures(sweep, filter_set)}
-        lacking = {"highest": None, "mean": None, "sd": None}
-        rows = [by_name.get(arch, {"arch": arch, **lacking}) for arch in names]
+        by_name = {row.arch: row for row in architectures(sweep, filter_set)}
+        rows = [by_name.get(arch) or ArchitectureScores(arch, filter_set, None, None, None, 0, 0) for arch in names]
         _accuracy_bars(axes, rows, "epochs and batch")
         axes.set_title(f"({chr(97 + i % 26)})  [{filter_set.replace('/', ' ')}]", fontsize=9.5, loc="left")
         axes.set_xlabel(score_label(sweep, "Accuracy (% of test windows)"), fontsize=8.5)
@@ -135,17 +134,16 @@ def by_filters(sweep: SweepResults) -> Figure:
     return figure
 
 
-def _bars(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _best(rows: Sequence[ArchitectureScores]) -> list[ArchitectureScores]:
     """Return the `BARS` rows with the highest accuracy, in their original order."""
-    best = sorted(rows, key=lambda r: -(r["highest"] or 0.0))[:BARS]
+    best = sorted(rows, key=lambda r: -(r.highest or 0.0))[:BARS]
     return [row for row in rows if row in best]
 
 
-def _accuracy_bars(axes: Axes, rows: Sequence[Row], over: str) -> None:
+def _accuracy_bars(axes: Axes, rows: Sequence[ArchitectureScores], over: str) -> None:
     at = np.arange(len(rows))
-    high, mean, sd = (
-        np.array([100 * r[k] if finite(r[k]) else np.nan for r in rows]) for k in ("highest", "mean", "sd")
-    )
+    values = [(r.highest, r.mean, r.sd) for r in rows]
+    high, mean, sd = 100 * np.array(values, dtype=np.float64).reshape(-1, 3).T
     axes.barh(at - 0.2, high, 0.38, color=MAX, label="highest")
     axes.barh(at + 0.2, mean, 0.38, color=MEAN, edgecolor=MAX, linewidth=0.6, label=f"mean over {over} ± sd")
     some = sd > 0
@@ -159,7 +157,7 @@ def _accuracy_bars(axes: Axes, rows: Sequence[Row], over: str) -> None:
             axes.text(at_x, y - 0.19, f"{value:.1f}", va="center", fontsize=7.5, color=ink)
         else:
             axes.text(1.2, y, "no trial done", va="center", fontsize=7.5, color="#57606a")
-    axes.set_yticks(at, [str(r["arch"]) for r in rows], parse_math=False)
+    axes.set_yticks(at, [r.arch for r in rows], parse_math=False)
     axes.tick_params(labelsize=8)
     axes.set_xlim(0, 100)
     axes.set_ylim(len(rows) - 0.4, -0.6)
@@ -173,7 +171,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8, frameon=False)
 
 
-def size_and_accuracy(sweep: SweepResults) -> Figure:
+def size_and_accuracy(sweep: StoredSweep) -> Figure:
     """Draw the paper's Figure 9: accuracy against the number of parameters, for the networks of Table 4."""
     rows = top_rows(table4(sweep))
     figure = _figure(sweep, 9.2, 5.2, f"{LIKE.format(9)}: accuracy and size of the best of each size class")
@@ -188,86 +186,57 @@ def size_and_accuracy(sweep: SweepResults) -> Figure:
     _log_x(axes, [p.x for p in points], "Learnable parameters")
     _room(axes, [p.y for p in points])
     axes.set_ylabel(score_label(sweep, "Highest accuracy (% of test windows)"), fontsize=9)
-    axes.legend(
-        title="filters", fontsize=8, title_fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False
-    )
+    _class_legend(axes)
     figures.place_labels(figure, axes, points)
     return figure
 
 
-def pareto(sweep: SweepResults, cost: str) -> Figure:
+def pareto(sweep: StoredSweep, cost: str) -> Figure:
     """Draw the best macro-F1 of each network against a cost, with the Pareto front as a line with labelled points."""
-    rows = pareto_points(sweep, cost)
+    points = pareto_points(sweep, cost)
     label = COSTS[cost]
     figure = _figure(sweep, 9.2, 5.2, f"Macro-F1 against {label[0].lower()}{label[1:]}")
     axes = figure.add_subplot()
-    edge = [r for r in rows if r["front"]]
-    steps = sorted({(r["value"], r["macro_f1"]) for r in edge})
-    _log_x(axes, [r["value"] for r in rows], f"{label}, log scale")
-    _room(axes, [r["macro_f1"] for r in rows])
+    edge = [p for p in points if p.front]
+    steps = sorted({(p.value, p.macro_f1) for p in edge})
+    _log_x(axes, [p.value for p in points], f"{label}, log scale")
+    _room(axes, [p.macro_f1 for p in points])
     right = axes.get_xlim()[1]
-    axes.plot(
-        [*(x for x, _ in steps), right],
-        [*(y for _, y in steps), steps[-1][1]],
-        color="#333333",
-        linewidth=1.2,
-        drawstyle="steps-post",
-        zorder=1,
-        label="front",
-    )
+    corners = [*steps, (right, steps[-1][1])]
+    front: dict[str, Any] = {
+        "color": "#333333",
+        "linewidth": 1.2,
+        "drawstyle": "steps-post",
+        "zorder": 1,
+        "label": "front",
+    }
+    axes.plot([x for x, _ in corners], [y for _, y in corners], **front)
+    styles: dict[bool, dict[str, Any]] = {
+        False: {"alpha": 0.55, "markeredgecolor": "#777777", "markeredgewidth": 0.5, "markersize": 5.5, "zorder": 2},
+        True: {"alpha": 1.0, "markeredgecolor": "black", "markeredgewidth": 1.3, "markersize": 9, "zorder": 3},
+    }
     for filter_set, (marker, colour) in _by_class(sweep):
-        for on in (False, True):
-            mine = [r for r in rows if r["filter_set"] == filter_set and r["front"] is on]
-            if mine:
-                axes.plot(
-                    [r["value"] for r in mine],
-                    [r["macro_f1"] for r in mine],
-                    marker,
-                    color=colour,
-                    alpha=1.0 if on else 0.55,
-                    markeredgecolor="black" if on else "#777777",
-                    markeredgewidth=1.3 if on else 0.5,
-                    markersize=9 if on else 5.5,
-                    zorder=3 if on else 2,
-                )
+        for on, style in styles.items():
+            mine = [p for p in points if p.filter_set == filter_set and p.front is on]
+            axes.plot([p.value for p in mine], [p.macro_f1 for p in mine], marker, color=colour, **style)
         axes.plot([], [], marker, color=colour, markeredgecolor="black", markersize=7, label=_bracket(filter_set))
     axes.set_ylabel(score_label(sweep, "Best macro-F1 (0 to 1)"), fontsize=9)
-    axes.legend(
-        title="filters", fontsize=8, title_fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False
-    )
-    named = sorted(edge, key=lambda r: -r["macro_f1"])[:NAMED]
-    others = [figures.LabelledPoint(r["value"], r["macro_f1"], "") for r in rows if r not in named]
-    labels = [figures.LabelledPoint(r["value"], r["macro_f1"], f"{r['arch']}\n{r['filters']}") for r in named]
-    corners = [*steps, (right, steps[-1][1])]
+    _class_legend(axes)
+    named = sorted(edge, key=lambda p: -p.macro_f1)[:NAMED]
+    labels = [figures.LabelledPoint(p.value, p.macro_f1, f"{p.arch}\n{p.filters}") for p in named]
+    labels += [figures.LabelledPoint(p.value, p.macro_f1, "") for p in points if p not in named]
     flat = [(x, y, after, y) for (x, y), (after, _) in pairwise(corners)]
     upright = [(after, y, after, high) for (_, y), (after, high) in pairwise(corners)]
-    figures.place_labels(figure, axes, labels + others, avoid=flat + upright)
+    figures.place_labels(figure, axes, labels, avoid=flat + upright)
     return figure
 
 
-def acr_bars(sweep: SweepResults) -> Figure:
-    """Draw the networks with the highest accuracy–complexity ratio."""
-    rows = acr_ranking(sweep).rows[:_RANKED]
-    figure = _figure(sweep, 9.2, 1.4 + 0.3 * len(rows), "Accuracy–complexity ratio of the best networks")
-    axes = figure.add_subplot()
-    at = np.arange(len(rows))
-    values = [100 * (r["acr"] or 0.0) for r in rows]
-    axes.barh(at, values, 0.62, color=MAX)
-    for y, (value, row) in enumerate(zip(values, rows, strict=True)):
-        label = f"{value:.1f}   accuracy {100 * row['accuracy']:.1f} %, {count(row['parameters'])} parameters"
-        # Write the value inside a bar that is long enough.
-        inside = value > 0.5 * max(values)
-        at_x, ink = (0.01 * max(values), "white") if inside else (value + 0.01 * max(values), "black")
-        axes.text(at_x, y, label, va="center", fontsize=7.5, color=ink)
-    axes.set_yticks(at, [f"{r['arch']}  {r['filters']}" for r in rows], parse_math=False)
-    axes.tick_params(labelsize=8)
-    axes.set_ylim(len(rows) - 0.4, -0.6)
-    axes.set_xlabel(score_label(sweep, "ACR = accuracy (%) / log10(parameters)"), fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure
+def _class_legend(axes: Axes) -> None:
+    place: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "frameon": False}
+    axes.legend(title="filters", fontsize=8, title_fontsize=8, **place)
 
 
-def schedules(sweep: SweepResults) -> Figure:
+def schedules(sweep: StoredSweep) -> Figure:
     """Draw accuracy and macro-F1 by epochs and batch: means over the networks, with standard deviations as bars."""
     rows = effect(sweep).rows
     lengths, sizes = epochs(sweep), batches(sweep)
@@ -312,7 +281,7 @@ def schedules(sweep: SweepResults) -> Figure:
     return figure
 
 
-def curves(sweep: SweepResults, trial: Row) -> Figure | None:
+def curves(sweep: StoredSweep, trial: Row) -> Figure | None:
     """Draw the learning curves of a trial in training and validation; None if none were stored."""
     histories = sweep.histories(trial)
     if not histories:
@@ -322,7 +291,7 @@ def curves(sweep: SweepResults, trial: Row) -> Figure | None:
     return figure
 
 
-def confusion(sweep: SweepResults, trial: Row) -> Figure | None:
+def confusion(sweep: StoredSweep, trial: Row) -> Figure | None:
     """Draw a confusion matrix as in the paper's Figures 10 and 11, with classes sorted and framed by affect."""
     counts = sweep.confusion(str(trial["trial"]))
     if counts is None:
@@ -359,7 +328,7 @@ def affect_order(affects: Sequence[str]) -> list[int]:
     return sorted(range(len(affects)), key=lambda i: (ranks[affects[i]], i))
 
 
-def _by_class(sweep: SweepResults) -> list[tuple[str, tuple[str, str]]]:
+def _by_class(sweep: StoredSweep) -> list[tuple[str, tuple[str, str]]]:
     """Return each filter set with its marker and colour."""
     return [(s, CLASSES[i % len(CLASSES)]) for i, s in enumerate(sweep.filter_sets)]
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError, need
-from plushsense.experiments.sweep.results import SweepResults, finite
+from plushsense.experiments.sweep.results import StoredSweep, finite
+from plushsense.experiments.sweep.trials import TRIAL_COLUMNS
 from plushsense.reports.table import Row
-from plushsense.trials.tables import TRIAL_COLUMNS
 
 TRIAL = "plushsense.trial"
 _PARAMS = ("arch", "filters", "filter_set", "padding", "norm", "epochs", "batch", "batch_asked", "seeds", "folds")
@@ -19,14 +20,21 @@ _METRICS = tuple(key for key, c in TRIAL_COLUMNS.items() if c.type in (int, floa
 _PAGE = 1000
 
 
-def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class MlflowResult:
+    """Where trials were logged, and how many now (``new``) and earlier (``before``)."""
+
+    uri: str
+    experiment: str
+    new: int
+    before: int
+
+
+def export_trials(sweep: StoredSweep, where: str | os.PathLike[str]) -> MlflowResult:
     """Log each complete trial as a run, unless an earlier export has logged it.
 
     Args:
         where: a tracking URI (``sqlite:///…``, ``http://…``), or a folder, in which ``mlflow.db`` is created.
-
-    Returns:
-        ``uri``, ``experiment``, and the numbers of trials logged now (``new``) and earlier (``before``).
 
     Raises:
         ConfigError: when MLflow cannot use ``where``; MissingExtraError: when it is not installed.
@@ -58,8 +66,7 @@ def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> dict[st
         raise ConfigError(
             f"MLflow refuses '{where}' ({reason}): give a folder, or a URI such as sqlite:///x.db."
         ) from None
-    before = len(sweep.done) - len(finished)
-    return {"uri": uri, "experiment": title, "new": len(finished), "before": before}
+    return MlflowResult(uri, title, len(finished), len(sweep.done) - len(finished))
 
 
 def _place(where: str) -> tuple[str, str | None]:
@@ -91,7 +98,7 @@ def _there(client: Any, experiment: str) -> dict[str, tuple[str, str]]:
             return runs
 
 
-def _log(mlflow: Any, client: Any, experiment: str, run: str, sweep: SweepResults, trial: Row) -> None:
+def _log(mlflow: Any, client: Any, experiment: str, run: str, sweep: StoredSweep, trial: Row) -> None:
     """Log a trial as one run; ``run`` is the id of an unfinished run of an earlier export to complete, or ""."""
     entities, head = mlflow.entities, sweep.head
     marks = " [leaky]" * sweep.leaky + " [simulation]" * sweep.simulated

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,18 +13,20 @@ import numpy as np
 from plushsense.dataset.store import writing_around
 from plushsense.experiments.sweep import figures as draw
 from plushsense.experiments.sweep import tables
-from plushsense.experiments.sweep.results import SweepResults, file_name_of, name_of, read_sweep
+from plushsense.experiments.sweep.folder import SUMMARY
+from plushsense.experiments.sweep.grid import GRID_TRAINING
+from plushsense.experiments.sweep.results import StoredSweep, file_name_of, name_of, read_sweep
 from plushsense.reports import wording
 from plushsense.reports.figures import png, svg, svg_uri
 from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
 from plushsense.reports.table import DASH, Row, Table, count, number, text
 from plushsense.scoring.metrics import grouped
 from plushsense.training.spec import PRESETS
-from plushsense.trials.grid import GRID_TRAINING
-from plushsense.trials.tables import SUMMARY
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from plushsense.experiments.sweep.mlflow import MlflowResult
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Section:
     more_drawings: tuple[Drawing, ...] = ()
 
 
-def sections_of(sweep: SweepResults) -> Iterator[Section]:
+def sections_of(sweep: StoredSweep) -> Iterator[Section]:
     """Yield the sections of the report in the paper's order; without any finished trial, only those without scores."""
     if not sweep.done:
         yield Section("best", "The best trials", dropped=("No trial is done yet: there is no score to show.",))
@@ -66,7 +68,6 @@ def sections_of(sweep: SweepResults) -> Iterator[Section]:
     yield _parameters(sweep)
     yield _by_filters(sweep)
     yield _top(sweep)
-    yield Section("acr", "ACR ranking", (tables.acr_ranking(sweep),), (_acr(sweep),))
     yield _effect(sweep)
     trials = _looked_at(sweep, best)
     yield _confusions(sweep, trials)
@@ -74,36 +75,30 @@ def sections_of(sweep: SweepResults) -> Iterator[Section]:
     yield _fronts(sweep)
 
 
-def _parameters(sweep: SweepResults) -> Section:
+def _parameters(sweep: StoredSweep) -> Section:
     return Section("table-3", "Parameters (the paper's Table 3)", (tables.table3(sweep),), scores=False)
 
 
-def _overview(sweep: SweepResults) -> Section:
-    rows = sorted(tables.architectures(sweep), key=lambda r: -(r["highest"] or 0.0))
+def _overview(sweep: StoredSweep) -> Section:
+    rows = tables.architectures(sweep)
+    best = max(rows, key=lambda row: row.highest or 0.0)
     alt = (
-        f"Bars: highest and mean accuracy of {len(rows)} architectures. The first: {_bar_words(rows[:3])}. "
-        f"Diamonds: parameters. {draw.LIKE.format(7)}."
+        f"Bars: highest and mean accuracy of {len(rows)} architectures, the highest of {best.arch}. Diamonds: "
+        f"parameters. {draw.LIKE.format(7)}; the table has the numbers."
     )
-    dropped = _only_best(len(rows))
-    return Section(
-        "figure-7",
-        "Accuracy of each architecture (the paper's Figure 7)",
-        (tables.architecture_table(sweep),),
-        (Drawing("figure-7-architectures", draw.by_architecture(sweep), alt),),
-        dropped,
-    )
+    drawing = Drawing("figure-7-architectures", draw.by_architecture(sweep), alt)
+    title = "Accuracy of each architecture (the paper's Figure 7)"
+    return Section("figure-7", title, (tables.architecture_table(sweep),), (drawing,), _only_best(len(rows)))
 
 
-def _by_filters(sweep: SweepResults) -> Section:
+def _by_filters(sweep: StoredSweep) -> Section:
     title = "Accuracy by filter set (the paper's Figure 8)"
     if len(sweep.filter_sets) < 2:
         return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
-    best = []
-    for filter_set in sweep.filter_sets[::-1]:
-        rows = sorted(tables.architectures(sweep, filter_set), key=lambda r: -(r["highest"] or 0.0))
-        best.append(f"{filter_set}: {_bar_words(rows[:1])}")
-    alt = f"A panel of bars a filter set: highest and mean accuracy of each architecture. The best: {'; '.join(best)}."
-    alt += f" {draw.LIKE.format(8)}."
+    alt = (
+        "A panel of bars a filter set: highest and mean accuracy of each architecture. "
+        f"{draw.LIKE.format(8)}; the table above has the numbers."
+    )
     drawing = Drawing("figure-8-filter-sets", draw.by_filters(sweep), alt)
     return Section("figure-8", title, drawings=(drawing,), dropped=_only_best(len(sweep.archs)))
 
@@ -114,60 +109,32 @@ def _only_best(architectures: int) -> tuple[str, ...]:
     return (f"Drawn are the best {draw.BARS} of {architectures} architectures; the CSV has all.",)
 
 
-def _bar_words(rows: Sequence[Row]) -> str:
-    return ", ".join(
-        f"{r['arch']} {100 * r['highest']:.1f} % (mean {100 * r['mean']:.1f} %)"
-        if r["highest"] is not None
-        else f"{r['arch']} not done"
-        for r in rows
-    )
-
-
-def _top(sweep: SweepResults) -> Section:
+def _top(sweep: StoredSweep) -> Section:
     table = tables.table4(sweep)
     title = "The best of each size class (the paper's Table 4 and Figure 9)"
     if len(table.rows) < 2:
-        return Section(
-            "table-4", title, (table,), dropped=("One network only is scored: Figure 9 would be one point.",)
-        )
-    first = ", ".join(
-        f"{r['arch']} {r['filters']} {100 * r['accuracy']:.1f} % at {count(r['parameters'])}" for r in table.rows[:3]
-    )
-    alt = (
-        f"Points: accuracy against parameters of {len(tables.top_rows(table))} networks. The most accurate: {first} "
-        f"parameters. {draw.LIKE.format(9)}."
-    )
+        dropped = ("One network only is scored: Figure 9 would be one point.",)
+        return Section("table-4", title, (table,), dropped=dropped)
+    points = len(tables.top_rows(table))
+    alt = f"Points: accuracy against parameters of {points} networks. {draw.LIKE.format(9)}; the table has the numbers."
     return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
 
 
-def _acr(sweep: SweepResults) -> Drawing:
-    first = tables.acr_ranking(sweep).rows[0]
-    name = f"{first['arch']} {first['filters']}"
-    alt = f"Bars: the networks with the highest ACR. The first: {name}, {100 * (first['acr'] or 0):.1f} %."
-    return Drawing("acr", draw.acr_bars(sweep), alt)
-
-
-def _effect(sweep: SweepResults) -> Section:
-    title = "Effect of epochs and batch"
+def _effect(sweep: StoredSweep) -> Section:
+    title, table = "Effect of epochs and batch", tables.effect(sweep)
     if len(tables.epochs(sweep)) * len(tables.batches(sweep)) < 2:
-        return Section(
-            "effect", title, dropped=("All trials have the same epochs and batch: there is nothing to compare.",)
-        )
-    table = tables.effect(sweep)
+        dropped = ("All trials have the same epochs and batch: there is nothing to compare.",)
+        return Section("effect", title, dropped=dropped)
     if len(table.rows) < 2:
-        return Section(
-            "effect", title, (table,), dropped=("One schedule only is scored yet: there is nothing to compare.",)
-        )
-    means = ", ".join(
-        f"{r['epochs']} epochs, batch {r['batch_asked']}: {100 * r['accuracy']:.1f} %" for r in table.rows
-    )
-    alt = f"Lines: mean accuracy and macro-F1 over the networks. {means}."
+        dropped = ("One schedule only is scored yet: there is nothing to compare.",)
+        return Section("effect", title, (table,), dropped=dropped)
+    alt = "Lines: mean accuracy and macro-F1 over the networks by epochs and batch; the table has the numbers."
     return Section("effect", title, (table,), (Drawing("effect", draw.schedules(sweep), alt),))
 
 
-def _looked_at(sweep: SweepResults, best: Row) -> list[Row]:
+def _looked_at(sweep: StoredSweep, best: Row) -> list[Row]:
     """Return the trials to show with confusions and curves: the paper's two networks if in the grid, and the best."""
-    candidates = [sweep.chosen, sweep.second, best]
+    candidates = [*(sweep.best_of(*network) for network in draw.PAPER_CONFUSIONS), best]
     return list({t["trial"]: t for t in candidates if t}.values())
 
 
@@ -175,7 +142,7 @@ _MATRICES = 12
 """Largest number of confusion matrices on the page; all are files."""
 
 
-def _confusions(sweep: SweepResults, trials: Sequence[Row]) -> Section:
+def _confusions(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
     title = "Confusions (the paper's Figures 10 and 11)"
     if len(sweep.labels) < 2:
         return Section("confusion", title, dropped=("The sweep names no classes: there is nothing to confuse.",))
@@ -208,7 +175,7 @@ def _confusions(sweep: SweepResults, trials: Sequence[Row]) -> Section:
     )
 
 
-def confusion_words(sweep: SweepResults, trial: Row) -> str:
+def confusion_words(sweep: StoredSweep, trial: Row) -> str:
     """Describe a confusion matrix in words: shares that are right, wrong within an affect, and wrong across affects."""
     counts = np.asarray(sweep.confusion(str(trial["trial"])), dtype=np.int64)
     total, right = int(counts.sum()), int(np.trace(counts))
@@ -229,7 +196,7 @@ def confusion_words(sweep: SweepResults, trial: Row) -> str:
     return description + (f". {draw.LIKE.format(number)}." if number else ".")
 
 
-def _curves(sweep: SweepResults, trials: Sequence[Row]) -> Section:
+def _curves(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
     drawings, dropped = [], []
     for trial in trials:
         figure = draw.curves(sweep, trial)
@@ -241,17 +208,17 @@ def _curves(sweep: SweepResults, trials: Sequence[Row]) -> Section:
     return Section("curves", "Learning curves", drawings=tuple(drawings), dropped=tuple(dropped))
 
 
-def _fronts(sweep: SweepResults) -> Section:
+def _fronts(sweep: StoredSweep) -> Section:
     drawings, dropped = [], []
     for cost, label in tables.COSTS.items():
         points = tables.pareto_points(sweep, cost)
-        values = {p["value"] for p in points}
+        values = {p.value for p in points}
         if len(values) < 2:
             same = f": {count(next(iter(values)))} for all" if values else ""
             dropped.append(f"No front of macro-F1 against “{label.lower()}”, which does not differ{same}.")
             continue
-        edge = [p for p in points if p["front"]]
-        members = "; ".join(f"{p['arch']} {p['filters']} ({count(p['value'])}, {p['macro_f1']:.3f})" for p in edge)
+        edge = [p for p in points if p.front]
+        members = "; ".join(f"{p.arch} {p.filters} ({count(p.value)}, {p.macro_f1:.3f})" for p in edge)
         alt = f"Points: macro-F1 against {label.lower()} of {len(points)} networks, log scale. On the front: {members}."
         drawings.append(Drawing(f"pareto-{cost.replace('_', '-')}", draw.pareto(sweep, cost), alt))
     return Section("pareto", "Pareto fronts", (tables.pareto(sweep),), tuple(drawings), tuple(dropped))
@@ -266,13 +233,44 @@ def is_sweep(folder: str | os.PathLike[str]) -> bool:
     return (Path(folder) / SUMMARY).is_file()
 
 
+@dataclass(frozen=True)
+class ReportResult:
+    """A written report: its page, the folder ``files`` with ``n_files`` tables and figures, and the trials in it."""
+
+    report: Path
+    files: Path
+    n_files: int
+    trials: int
+    done: int
+    mlflow: MlflowResult | None = None
+
+    @property
+    def summary(self) -> list[str]:
+        """What was written, in words."""
+        lines = [f"{self.n_files} tables and figures in {self.files}"]
+        if (logged := self.mlflow) is not None:
+            lines.append(f"MLflow: {logged.new} trials logged, {logged.before} were there already ({logged.uri})")
+        return lines
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "report": str(self.report),
+            "files": str(self.files),
+            "trials": self.trials,
+            "done": self.done,
+            "mlflow": None if self.mlflow is None else asdict(self.mlflow),
+            "said": self.summary,
+        }
+
+
 def write_sweep_report(
     folder: str | os.PathLike[str],
     page: str | os.PathLike[str] | None = None,
     *,
     title: str | None = None,
     mlflow: str | os.PathLike[str] | None = None,
-) -> dict[str, Any]:
+) -> ReportResult:
     """Write the page of a sweep and, in a folder beside it, each table as CSV and each figure as PNG and SVG.
 
     Args:
@@ -280,10 +278,6 @@ def write_sweep_report(
         page: the .html file (default: ``report.html`` in the folder); an older report there is replaced.
         title: heading of the page.
         mlflow: a folder or a tracking URI to which the trials are also logged, see `export_trials`.
-
-    Returns:
-        ``report``, ``files`` (the folder), ``trials``, ``done``, ``mlflow`` ({uri, experiment, new, before} or None),
-        and ``said``, the same in words.
 
     Raises:
         BadInput: where there is no sweep; ConfigError: where the page or its files would replace something else.
@@ -306,27 +300,16 @@ def write_sweep_report(
     with writing():
         write_files(beside, files, before)
         write_page(target, page_text)
-    summary = [f"{len(files)} tables and figures in {beside}"]
     logged = None
     if mlflow is not None:
         from plushsense.experiments.sweep.mlflow import export_trials
 
         logged = export_trials(sweep, mlflow)
-        summary.append(
-            f"MLflow: {logged['new']} trials logged, {logged['before']} were there already ({logged['uri']})"
-        )
-    return {
-        "report": str(target),
-        "files": str(beside),
-        "trials": sweep.total,
-        "done": len(sweep.done),
-        "mlflow": logged,
-        "said": summary,
-    }
+    return ReportResult(target, beside, len(files), sweep.total, len(sweep.done), logged)
 
 
 def render(
-    sweep: SweepResults,
+    sweep: StoredSweep,
     sections: Sequence[Section],
     pictures: Mapping[str, bytes],
     *,
@@ -348,7 +331,7 @@ def render(
     )
 
 
-def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
+def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
     """Return grid, data and split as (name, value) pairs."""
     head = sweep.head
     how, who = wording.describe_split(str(head.get("split")))
@@ -376,7 +359,9 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
         ("Seeds and folds", wording.describe_runs(sweep.trials)),
         (
             "Trials",
-            f"{len(sweep.done)} of {sweep.total} done" + (f", {waiting} waiting or partial" if waiting else ""),
+            f"{len(sweep.done)} of {sweep.total} done"
+            + (f", {waiting} waiting or partial" if waiting else "")
+            + (f"; {sweep.dropped} more dropped by halving" if sweep.dropped else ""),
         ),
         ("Classes", text(sweep.labels)),
         ("Time", f"{number(seconds, 0)} s" if number(seconds) != DASH else DASH),
@@ -385,7 +370,7 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
     ]
 
 
-def training_settings(sweep: SweepResults) -> list[tuple[str, str]]:
+def training_settings(sweep: StoredSweep) -> list[tuple[str, str]]:
     """Return the settings of the networks and their training, with those of the preset filled in."""
     grid = sweep.head.get("grid") or {}
     preset = PRESETS.get(str(sweep.head.get("preset")))
@@ -406,7 +391,7 @@ def training_settings(sweep: SweepResults) -> list[tuple[str, str]]:
     ]
 
 
-def _template_values(sweep: SweepResults, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
+def _template_values(sweep: StoredSweep, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
     return {
         "key": section.key,
         "title": section.title,
@@ -426,7 +411,7 @@ def _template_values(sweep: SweepResults, section: Section, pictures: Mapping[st
 
 
 def _contents(
-    sweep: SweepResults, sections: Sequence[Section], pictures: Mapping[str, bytes]
+    sweep: StoredSweep, sections: Sequence[Section], pictures: Mapping[str, bytes]
 ) -> Iterator[tuple[str, bytes]]:
     """Yield the name and content of each file; every table includes the data and split of its scores."""
     source = {"dataset": sweep.head.get("dataset"), "split": sweep.head.get("split")}

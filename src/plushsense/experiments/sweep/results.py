@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import BadInput, need
+from plushsense.experiments.sweep.folder import CURVES, RUNS, SUMMARY, TRIALS, prediction_files
 from plushsense.reports.table import Row
-from plushsense.trials.grid import CHOSEN, SECOND
-from plushsense.trials.tables import CURVES, RUNS, SUMMARY, TRIALS, prediction_files
 
 _NEEDED = ("trial", "arch", "filters", "filter_set", "epochs", "batch_asked", "parameters", "accuracy", "macro_f1")
 
@@ -55,7 +54,7 @@ class SweepNetwork:
 
 
 @dataclass(frozen=True)
-class SweepResults:
+class StoredSweep:
     """The content of a sweep's results folder: ``head`` is sweep.json; the tables are rows."""
 
     folder: Path
@@ -81,7 +80,13 @@ class SweepResults:
 
     @property
     def total(self) -> int:
-        return max(len(self.trials), int(self.head.get("trials") or 0))
+        """Number of trials, without those that halving dropped."""
+        return len(self.trials) - self.dropped
+
+    @property
+    def dropped(self) -> int:
+        """Number of trials that halving did not train."""
+        return sum(trial.get("status") == "dropped" for trial in self.trials)
 
     @property
     def done(self) -> list[Row]:
@@ -133,19 +138,10 @@ class SweepResults:
             by_run.setdefault((row["run"], row.get("seed"), row.get("fold")), []).append(row)
         return list(by_run.values())
 
-    @property
-    def chosen(self) -> Row | None:
-        """The trial with the highest accuracy of the network that the paper chose; None if it has no score."""
-        return self.best_of(*CHOSEN)
-
     def best_of(self, arch: str, filters: str) -> Row | None:
+        """Return the trial of a network with the highest accuracy; None if it has no score."""
         mine = [t for t in self.done if (t["arch"], t["filters"]) == (arch, filters)]
         return max(mine, key=lambda t: float(t["accuracy"])) if mine else None
-
-    @property
-    def second(self) -> Row | None:
-        """The trial with the highest accuracy of the other network that the paper shows; None if it has no score."""
-        return self.best_of(*SECOND)
 
     @property
     def kept(self) -> list[Row]:
@@ -159,7 +155,7 @@ class SweepResults:
         return max(self.done, key=lambda t: (float(t["accuracy"]), -int(t["parameters"])), default=None)
 
 
-def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
+def read_sweep(folder: str | os.PathLike[str]) -> StoredSweep:
     """Read the results folder of a sweep.
 
     Raises:
@@ -180,7 +176,7 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
     if not isinstance(head, dict):
         raise BadInput(f"'{place / SUMMARY}' is not a sweep (no object): run the sweep again to rebuild it.")
     trials = _table(place / TRIALS, needed=_NEEDED)
-    return SweepResults(place, head, trials, _table(place / RUNS, missing=True))
+    return StoredSweep(place, head, trials, _table(place / RUNS, missing=True))
 
 
 def _table(path: Path, needed: Sequence[str] = (), *, missing: bool = False) -> tuple[Row, ...]:

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
+from plushsense.experiments.sweep.folder import BEST
 from plushsense.experiments.sweep.results import (
+    StoredSweep,
     SweepNetwork,
-    SweepResults,
     file_name_of,
     finite,
     name_of,
     schedule,
     spread,
 )
+from plushsense.experiments.sweep.trials import listed_columns
 from plushsense.models.arch import PAPER_FILTERS, TABLE3, TABLE3_MISPRINT, Arch, slashed
 from plushsense.reports.table import Column, Row, Table, count
 from plushsense.scoring.metrics import accuracy_complexity_ratio, column_metrics, pareto_front
-from plushsense.trials.tables import BEST, listed_columns
 
 SHOWN = 20
 """Number of rows of a long table that the page shows; the CSV has all."""
@@ -113,28 +114,35 @@ def _metric_columns(*, without: str) -> list[Column]:
     ]
 
 
-def architectures(sweep: SweepResults, filter_set: str | None = None) -> list[dict[str, Any]]:
-    """Return highest and mean accuracy of each architecture, over one or all filter sets (Figures 7 and 8)."""
+@dataclass(frozen=True)
+class ArchitectureScores:
+    """Accuracy of an architecture over its trials with one filter set, or with "all" (Figures 7 and 8)."""
+
+    arch: str
+    filter_set: str
+    highest: float | None
+    mean: float | None
+    sd: float | None
+    trials: int
+    parameters: int
+
+
+def architectures(sweep: StoredSweep, filter_set: str | None = None) -> list[ArchitectureScores]:
+    """Return the accuracy of each architecture, over one or all filter sets."""
     rows = []
     for label in dict.fromkeys(n.label for n in sweep.networks):
         mine = [n for n in sweep.networks if n.label == label and filter_set in (None, n.filter_set)]
         scores = [float(t["accuracy"]) for n in mine for t in n.done]
         if mine:
+            mean, highest = statistics.fmean(scores) if scores else None, max(scores, default=None)
+            largest = max(n.parameters for n in mine)
             rows.append(
-                {
-                    "arch": label,
-                    "filter_set": filter_set or "all",
-                    "highest": max(scores, default=None),
-                    "mean": statistics.fmean(scores) if scores else None,
-                    "sd": spread(scores),
-                    "trials": len(scores),
-                    "parameters": max(n.parameters for n in mine),
-                }
+                ArchitectureScores(label, filter_set or "all", highest, mean, spread(scores), len(scores), largest)
             )
     return rows
 
 
-def architecture_table(sweep: SweepResults) -> Table:
+def architecture_table(sweep: StoredSweep) -> Table:
     """Return the numbers of Figures 7 and 8."""
     parts: list[str | None] = [None, *(sweep.filter_sets if len(sweep.filter_sets) > 1 else [])]
     columns = (
@@ -146,62 +154,30 @@ def architecture_table(sweep: SweepResults) -> Table:
         Column("trials", "Trials", "count"),
         Column("parameters", "Parameters (of the largest)", "count"),
     )
-    rows = tuple(row for part in parts for row in architectures(sweep, part))
+    rows = tuple(asdict(row) for part in parts for row in architectures(sweep, part))
     limit = len(architectures(sweep))
     name = "figure-7-and-8-architectures"
     return Table(name, "Each architecture over all its trials", columns, rows, (), limit)
 
 
-def acr_ranking(sweep: SweepResults) -> Table:
-    """Rank all networks by the accuracy–complexity ratio of their best trial."""
-    rows: list[dict[str, Any]] = [
-        {
-            "arch": n.label,
-            "filters": n.filters,
-            "parameters": n.parameters,
-            **{key: b.get(key) for key in column_metrics()},
-        }
-        | {"acr": accuracy_complexity_ratio(b["accuracy"], n.parameters)}
-        for n in sweep.networks
-        if (b := n.best())
-    ]
-    rows.sort(key=lambda r: -(r["acr"] or 0.0))
-    for rank, row in enumerate(rows, start=1):
-        row["rank"] = rank
-    columns = (
-        Column("rank", "Rank", "count"),
-        Column("arch", "Architecture"),
-        Column("filters", "Filters"),
-        Column("parameters", "Parameters", "count"),
-        Column("acr", "ACR", "percent", score=True),
-        Column("accuracy", "Highest accuracy", "percent", score=True),
-        *_metric_columns(without="accuracy"),
-    )
-    words = [
-        "ACR = accuracy / log10(parameters), in percent (paper, 3.6.3). It favours the small: ten times the parameters "
-        "must buy much accuracy to rank higher."
-    ]
-    return Table("acr", "Accuracy–complexity ratio", columns, tuple(rows), tuple(words), SHOWN)
-
-
-def batches(sweep: SweepResults) -> list[str]:
+def batches(sweep: StoredSweep) -> list[str]:
     """Return the batches as given in the grid, small to large, "full" last."""
     asked = {str(t["batch_asked"]) for t in sweep.trials}
     return sorted(asked, key=lambda b: (not b.isdecimal(), int(b) if b.isdecimal() else 0))
 
 
-def epochs(sweep: SweepResults) -> list[int]:
+def epochs(sweep: StoredSweep) -> list[int]:
     return sorted({int(t["epochs"]) for t in sweep.trials})
 
 
-def compared(sweep: SweepResults) -> tuple[list[SweepNetwork], bool]:
+def compared(sweep: StoredSweep) -> tuple[list[SweepNetwork], bool]:
     """Return the networks with a score for every schedule and True, or if there are none, those with any and False."""
     every = {(int(t["epochs"]), str(t["batch_asked"])) for t in sweep.trials}
     whole = [n for n in sweep.networks if {(int(t["epochs"]), str(t["batch_asked"])) for t in n.done} == every]
     return (whole, True) if whole else ([n for n in sweep.networks if n.done], False)
 
 
-def effect(sweep: SweepResults) -> Table:
+def effect(sweep: StoredSweep) -> Table:
     """Return mean and standard deviation over the networks for each number of epochs and batch."""
     networks, whole = compared(sweep)
     rows = []
@@ -252,30 +228,36 @@ def effect(sweep: SweepResults) -> Table:
     )
 
 
-def pareto_points(sweep: SweepResults, cost: str) -> list[dict[str, Any]]:
-    """Return each network with its cost, its best macro-F1, and whether it is on the Pareto front."""
-    rows = [
-        {
-            "cost": cost,
-            "value": int(t[cost]),
-            "macro_f1": float(t["macro_f1"]),
-            "arch": n.label,
-            "filters": n.filters,
-            "filter_set": n.filter_set,
-            "schedule": schedule(t),
-            "trial": t["trial"],
-        }
-        for n in sweep.networks
-        if (t := n.best("macro_f1")) and finite(t.get(cost)) and t[cost] > 0
+@dataclass(frozen=True)
+class ParetoPoint:
+    """A network with its best macro-F1 and a cost; ``front``: no other network beats it in both."""
+
+    value: int
+    macro_f1: float
+    arch: str
+    filters: str
+    filter_set: str
+    schedule: str
+    trial: str
+    front: bool
+
+
+def pareto_points(sweep: StoredSweep, cost: str) -> list[ParetoPoint]:
+    """Return the networks that have a score, by ascending cost (a key of `COSTS`)."""
+    best = [(n, t) for n in sweep.networks if (t := n.best("macro_f1")) and finite(t.get(cost)) and t[cost] > 0]
+    front = pareto_front([(float(t["macro_f1"]), t[cost]) for _, t in best])
+    points = [
+        ParetoPoint(
+            int(t[cost]), float(t["macro_f1"]), n.label, n.filters, n.filter_set, schedule(t), str(t["trial"]), on
+        )
+        for (n, t), on in zip(best, front, strict=True)
     ]
-    for row, on in zip(rows, pareto_front([(r["macro_f1"], r["value"]) for r in rows]), strict=True):
-        row["front"] = on
-    return sorted(rows, key=lambda r: (r["value"], -r["macro_f1"]))
+    return sorted(points, key=lambda point: (point.value, -point.macro_f1))
 
 
-def pareto(sweep: SweepResults) -> Table:
+def pareto(sweep: StoredSweep) -> Table:
     """Return the networks on the Pareto fronts of macro-F1 and each of `COSTS`."""
-    rows = [{**r, "cost": COSTS[cost]} for cost in COSTS for r in pareto_points(sweep, cost) if r["front"]]
+    rows = [{**asdict(p), "cost": name} for cost, name in COSTS.items() for p in pareto_points(sweep, cost) if p.front]
     columns = (
         Column("cost", "Front of macro-F1 against"),
         Column("value", "Cost", "count"),
@@ -296,7 +278,7 @@ TOP = 3
 """Number of networks of each size class (a filter set) in Table 4, as in the paper."""
 
 
-def best_trials(sweep: SweepResults) -> Table:
+def best_trials(sweep: StoredSweep) -> Table:
     """Return the `BEST` trials by accuracy, the highest first; of equal ones the smallest network first."""
     ranked = sorted(sweep.done, key=lambda t: (-float(t["accuracy"]), int(t["parameters"])))[:BEST]
     columns = tuple(c for c in listed_columns() if any(t.get(c.key) is not None for t in ranked))
@@ -304,53 +286,37 @@ def best_trials(sweep: SweepResults) -> Table:
     return Table("best-trials", "The best trials", columns, tuple(ranked), tuple(notes))
 
 
-def table3(sweep: SweepResults) -> Table:
+def table3(sweep: StoredSweep) -> Table:
     """Return the numbers of parameters by architecture and filter set, beside those of the paper's Table 3."""
-    sets = sweep.filter_sets[::-1]
-    cells: dict[tuple[str, str], SweepNetwork] = {(n.label, n.filter_set): n for n in sweep.networks}
-    rows, met, near, off, seen = [], 0, 0, [], False
-    other = any(
-        printed_parameters(n.arch, n.filters) and count_parameters(n.arch, n.filters) != n.parameters
-        for n in sweep.networks
-    )
-    for label in dict.fromkeys(n.label for n in sweep.networks):
-        row: dict[str, Any] = {"arch": label}
-        for filter_set in sets:
-            network = cells.get((label, filter_set))
-            if network is None:
-                continue
-            printed = printed_parameters(network.arch, network.filters)
-            row[f"{filter_set} ours"] = network.parameters
-            row[f"{filter_set} paper"] = printed
-            if printed is None:
-                continue
-            seen = True
-            ours = row[f"{filter_set} at the paper's size"] = count_parameters(network.arch, network.filters)
-            if is_misprint(network.arch, network.filters):
-                row[f"{filter_set} paper"] = f"{printed} (misprint?)"
-                off.append(f"{label} at {network.filters}: we count {count(ours)}, the paper prints {printed}")
-            elif agrees(printed, ours):
-                met += 1
-            elif abs(ours / parse_count(printed) - 1) <= 0.04:
-                near += 1
-            else:
-                off.append(f"{label} at {network.filters}: we count {count(ours)}, the paper prints {printed}")
-        rows.append(row)
+    rows: dict[str, dict[str, Any]] = {}
+    met, near, off, other = 0, 0, list[str](), False
+    for n in sweep.networks:
+        row = rows.setdefault(n.label, {"arch": n.label})
+        row[f"{n.filter_set} ours"] = n.parameters
+        printed = printed_parameters(n.arch, n.filters)
+        if printed is None:
+            continue
+        ours = row[f"{n.filter_set} at the paper's size"] = count_parameters(n.arch, n.filters)
+        other |= ours != n.parameters
+        misprint = is_misprint(n.arch, n.filters)
+        row[f"{n.filter_set} paper"] = printed + " (misprint?)" * misprint
+        if not misprint and agrees(printed, ours):
+            met += 1
+        elif not misprint and abs(ours / parse_count(printed) - 1) <= 0.04:
+            near += 1
+        else:
+            off.append(f"{n.label} at {n.filters}: we count {count(ours)}, the paper prints {printed}")
     columns = [Column("arch", "Architecture")]
-    for filter_set in sets:
+    for filter_set in sweep.filter_sets[::-1]:
         columns.append(Column(f"{filter_set} ours", f"[{filter_set.replace('/', ' ')}] ours", "count"))
-        if seen and other:
+        if other:
             head = f"at {PAPER_CHANNELS} channels, {PAPER_CLASSES} classes"
             columns.append(Column(f"{filter_set} at the paper's size", head, "count"))
-        if seen:
+        if met + near + len(off):
             columns.append(Column(f"{filter_set} paper", "paper"))
-    return Table(
-        "table-3",
-        "Learnable parameters (the paper's Table 3)",
-        tuple(columns),
-        tuple(rows),
-        tuple(_table3_words(met, near, off, other)),
-    )
+    notes = tuple(_table3_words(met, near, off, other))
+    title = "Learnable parameters (the paper's Table 3)"
+    return Table("table-3", title, tuple(columns), tuple(rows.values()), notes)
 
 
 def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[str]:
@@ -376,15 +342,15 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
     return words
 
 
-def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int = TOP) -> Table:
+def table4(sweep: StoredSweep) -> Table:
     """Return the best networks of each size class and all that the paper prints in Table 4, beside its figures."""
     rows = []
     for filter_set in sweep.filter_sets:
         mine = sorted((n for n in sweep.networks if n.filter_set == filter_set and n.done), key=_rank)
-        rows += [_table4_row(n, i, threshold) for i, n in enumerate(mine, 1) if i <= top or _printed(n)]
+        rows += [_table4_row(n, i) for i, n in enumerate(mine, 1) if i <= TOP or _printed(n)]
     rows.sort(key=lambda r: (-r["accuracy"], r["parameters"]))
     beside = any(row["paper_accuracy"] is not None for row in rows)
-    over = [n for n in sweep.networks if (b := n.best()) and float(b["accuracy"]) > threshold]
+    over = [n for n in sweep.networks if (b := n.best()) and float(b["accuracy"]) > PAPER_THRESHOLD]
     columns = [
         Column("arch", "Architecture"),
         Column("filters", "Filters"),
@@ -396,7 +362,7 @@ def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int 
         Column("paper_mean", "Paper: mean", "percent"),
         Column("acr", "ACR", "percent", score=True),
         Column("paper_acr", "Paper: ACR", "percent"),
-        Column("above", f"above {100 * threshold:g} %"),
+        Column("above", f"above {100 * PAPER_THRESHOLD:g} %"),
         *_metric_columns(without="accuracy"),
         Column("validated_accuracy", "Accuracy, chosen by validation", "percent", score=True),
         Column("schedule", "by (epochs, batch)"),
@@ -408,16 +374,16 @@ def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int 
         columns = [c for c in columns if not c.key.startswith("paper_")]
     scored = sum(bool(n.done) for n in sweep.networks)
     words = [
-        f"The best {top} of each size class (a filter set), by their highest accuracy over epochs and batch; the mean "
+        f"The best {TOP} of each size class (a filter set), by their highest accuracy over epochs and batch; the mean "
         "is over the same trials. The highest is picked on the test part, as the paper did, and so is optimistic: "
         "beside it, the test accuracy of the trial that validation would have picked.",
         f"The paper heads its Table 4 with accuracy above {100 * PAPER_THRESHOLD:g} %, and prints two rows below "
-        f"that; here {len(over)} of {scored} scored networks are above {100 * threshold:g} %, and rows below stay, "
+        f"that; here {len(over)} of {scored} scored networks are above it, and rows below stay, "
         "marked. ACR = accuracy / log10(parameters).",
     ]
     if beside:
         words += [
-            f"Networks that the paper prints stay in the table if they are not among the best {top}; for one that it "
+            f"Networks that the paper prints stay in the table if they are not among the best {TOP}; for one that it "
             "does not print, its columns have a dash (in the CSV, nothing).",
             PAPERS_SPLIT + (" This sweep has that split." if sweep.head.get("split") == AUTHORS_SPLIT else ""),
             "The paper's figures are of its own recordings: of other data than these, unless the data set above is "
@@ -428,9 +394,9 @@ def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int 
     )
 
 
-def top_rows(table: Table, top: int = TOP) -> list[Row]:
-    """Return the rows of Table 4 that are among the best ``top`` of their size class."""
-    return [row for row in table.rows if row["rank"] <= top]
+def top_rows(table: Table) -> list[Row]:
+    """Return the rows of Table 4 that are among the best `TOP` of their size class."""
+    return [row for row in table.rows if row["rank"] <= TOP]
 
 
 def _rank(network: SweepNetwork) -> tuple[float, int]:
@@ -442,7 +408,7 @@ def _printed(network: SweepNetwork) -> Table4Row | None:
     return TABLE4.get((network.arch, network.filters))
 
 
-def _table4_row(network: SweepNetwork, rank: int, threshold: float) -> dict[str, Any]:
+def _table4_row(network: SweepNetwork, rank: int) -> dict[str, Any]:
     best, validated = network.best(), network.best("validation_accuracy")
     assert best is not None
     printed = _printed(network)
@@ -459,7 +425,7 @@ def _table4_row(network: SweepNetwork, rank: int, threshold: float) -> dict[str,
         "acr": accuracy_complexity_ratio(best["accuracy"], network.parameters),
         **{key: best.get(key) for key in column_metrics() if key != "accuracy"},
         "validated_accuracy": validated["accuracy"] if validated else None,
-        "above": "yes" if float(best["accuracy"]) > threshold else "no",
+        "above": "yes" if float(best["accuracy"]) > PAPER_THRESHOLD else "no",
         "paper_parameters": printed.parameters if printed else None,
         "paper_accuracy": printed.highest if printed else None,
         "paper_mean": printed.mean if printed else None,
@@ -468,7 +434,7 @@ def _table4_row(network: SweepNetwork, rank: int, threshold: float) -> dict[str,
     }
 
 
-def confusion_table(sweep: SweepResults, trial: Row, name: str) -> Table:
+def confusion_table(sweep: StoredSweep, trial: Row, name: str) -> Table:
     """Return the confusion matrix of a trial, which must be stored: a row for each true class, in windows."""
     columns = (Column("truth", "Truth"), *(Column(f"read as {label}", label, "count") for label in sweep.labels))
     rows = tuple(
@@ -478,7 +444,7 @@ def confusion_table(sweep: SweepResults, trial: Row, name: str) -> Table:
     return Table(name, f"Confusions of {name_of(trial)}", columns, rows)
 
 
-def per_class(sweep: SweepResults, trial: Row) -> Table | None:
+def per_class(sweep: StoredSweep, trial: Row) -> Table | None:
     """Return recall, precision and F1 of each gesture in one trial; None if they were not stored."""
     stored = (sweep.head.get("per_class") or {}).get(trial["trial"])
     if not isinstance(stored, Sequence) or not all(isinstance(row, Mapping) for row in stored) or not stored:

@@ -27,7 +27,7 @@ INCOMING = "incoming"
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _MAX_REPORTS = 2000
 # Keys of a spec that are never stored, because they identify people.
-_SECRET_KEYS = ("words", "person")
+_SECRET_KEYS = ("person",)
 _STOP_S = 10.0
 
 

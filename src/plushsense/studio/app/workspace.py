@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
-from plushsense.dataset.importing.build import DEVICE_NAME
+from plushsense.dataset.importing.archives import DEVICE_NAME
 from plushsense.dataset.index import change_head
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.session_files import SESSION_HEAD

@@ -49,7 +49,6 @@ _TITLES = {
     "verify": "export.verifying",
     "publish": "publish.doing",
     "validate": "publish.checking",
-    "pseudonymise": "publish.renaming",
 }
 
 

@@ -11,7 +11,7 @@ from nicegui import context, run, ui
 from plushsense.dataset.privacy.forget import people_of_dataset
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
-from plushsense.studio.app.shell import Page, address, button, heading, named, on_page, tag
+from plushsense.studio.app.shell import Page, button, heading, named, on_page, tag
 from plushsense.studio.app.workspace import BACKUPS, BUNDLES, DATASETS, plain_name
 from plushsense.studio.pages.home.overview import DatasetEntry, WorkspaceSummary
 from plushsense.studio.pages.home.sections import (
@@ -57,7 +57,6 @@ class DatasetSection:
                 ui.space()
                 more = {
                     words("home.backup"): lambda: self._backup(entry),
-                    words("home.pseudonyms"): lambda: ui.navigate.to(address("publish", dataset=entry.path)),
                     words("home.forget"): lambda: ForgetDialog(page, self._jobs, entry).open(),
                 }
                 self._actions.menu(entry.path, entry.name, {} if entry.refused else more)

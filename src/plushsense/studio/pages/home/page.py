@@ -91,7 +91,6 @@ CHANGING = (
     "backup",
     "restore",
     "forget",
-    "pseudonymise",
     "check",
     "train",
     "sweep",

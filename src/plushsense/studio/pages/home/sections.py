@@ -30,7 +30,6 @@ PAGE_OF = {
     "export": "export",
     "verify": "export",
     "publish": "publish",
-    "pseudonymise": "publish",
     "restore": "review",
 }
 """Maps each task to the page that displays its result."""

@@ -178,7 +178,7 @@ class Validation:
         return [p.parent for p in sorted(found, key=lambda p: -p.stat().st_mtime)]
 
     def read(self, folder: Path) -> dict[str, Any]:
-        """Return a result, as `plushsense.experiments.protocol.run.live_protocol` returned it."""
+        """Return a result, as `plushsense.experiments.protocol.run.live_protocol` wrote it."""
         path = self._workspace.inside(folder) / RESULT
         try:
             result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -16,11 +16,11 @@ from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.privacy.pseudonyms import is_drawn
 from plushsense.dataset.publishing.checking import VALIDATORS
 from plushsense.dataset.publishing.contents import PUBLIC_COLUMNS
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE
 from plushsense.dataset.publishing.description import CHECKSUMS, REIDENTIFICATION_JSON
+from plushsense.dataset.publishing.keys import is_drawn
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import Dataset, read_people
 from plushsense.studio.app.guard import download_address
@@ -32,8 +32,6 @@ from plushsense.studio.widgets.elements import WorkPanel, link, notice, size, ta
 
 KEYS = "keys"
 """Subfolder of the workspace for secret key files, which are never part of a data set or package."""
-# Pseudonymised dates are later than this time in ms since 1970 (see `dataset.privacy.pseudonyms`).
-_MOVED_MS = 4_102_444_800_000
 _TOOLS = {
     "publish": ("mlcroissant", "frictionless", "datacite"),
     "baselines": ("sklearn",),
@@ -47,8 +45,7 @@ class DatasetFacts:
     Attributes:
         dataset: the data set, or None if it cannot be read; ``problem`` is then the reason.
         columns: columns of the table of people that are published only on request.
-        own_codes: codes of people that were not drawn at random by ``pseudonymise``.
-        own_dates: whether the recordings may have their true dates.
+        own_codes: codes of people that were not drawn at random.
     """
 
     path: Path
@@ -56,7 +53,6 @@ class DatasetFacts:
     problem: PlushSenseError | None = None
     columns: tuple[str, ...] = ()
     own_codes: tuple[str, ...] = ()
-    own_dates: bool = False
 
     @classmethod
     def of(cls, path: Path) -> DatasetFacts:
@@ -72,7 +68,6 @@ class DatasetFacts:
             dataset,
             columns=tuple(sorted(columns)),
             own_codes=tuple(s for s in dataset.subjects if not is_drawn(s)),
-            own_dates=any(0 < r.epoch_ms < _MOVED_MS for r in dataset.recordings),
         )
 
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.sentences import Sentence
 from plushsense.dataset.store import Dataset
 from plushsense.studio.app.jobs import StudioJob
-from plushsense.studio.app.shell import Page, address, button, focus, query, tag
-from plushsense.studio.app.workspace import DATASETS, PACKAGES, plain_name
+from plushsense.studio.app.shell import Page, button, focus, query, tag
+from plushsense.studio.app.workspace import PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
 from plushsense.studio.pages.publish.statements import Field, StatementsForm, beside, watched
 from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_to, style, text, titles
@@ -21,47 +18,8 @@ from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_
 _MAX_CODES = 5
 
 
-class PseudonymsForm:
-    """Advice to pseudonymise the data set, and the form that starts it.
-
-    Args:
-        start: called with the names of the new data set and the key file, the words to remove, and whether to drop
-            notes.
-    """
-
-    def __init__(
-        self, page: Page, chosen: DatasetFacts, start: Callable[[str, str, list[str], bool], Awaitable[None]]
-    ) -> None:
-        words, self._start = page.words, start
-        simulated = chosen.dataset is not None and chosen.dataset.head.simulated
-        if not chosen.own_codes and not chosen.own_dates:
-            tag(text(words("publish.renamed_already"), classes="ps-dim"), "renamed-already")
-            return
-        codes = ", ".join(chosen.own_codes[:_MAX_CODES]) + (" …" if len(chosen.own_codes) > _MAX_CODES else "")
-        with tag(ui.column().classes("w-full"), "advice"):
-            notice(words("publish.advice", codes=codes or "–"), "info" if simulated else "warning")
-        with tag(ui.expansion(words("publish.rename")).classes("w-full"), "rename"):
-            text(words("publish.rename_about"))
-            name = page.workspace.free_name(DATASETS, f"{chosen.path.name}-shared")
-            self.name = tag(ui.input(words("publish.rename_name"), value=name).props("maxlength=64"), "rename-name")
-            key = ui.input(words("publish.rename_key"), value=f"{chosen.path.name}-people.csv").props("maxlength=64")
-            self.key = tag(key, "rename-key")
-            for field in (self.name, self.key):
-                watched(field.classes("w-full"))
-            text(words("publish.key_place", folder=str(page.workspace.folder / KEYS)), classes="ps-dim")
-            self._listed = tag(ui.textarea(words("publish.rename_words")).props("autogrow").classes("w-full"), "words")
-            self._drop = tag(ui.checkbox(words("publish.rename_drop")), "drop-notes")
-            notice(words("publish.rename_safe"))
-            button("rename-do", words("publish.rename_do"), self._go, icon="masks")
-
-    async def _go(self) -> None:
-        listed = [line.strip() for line in (self._listed.value or "").splitlines() if line.strip()]
-        name, key = (self.name.value or "").strip(), (self.key.value or "").strip()
-        await self._start(name, key, listed, bool(self._drop.value))
-
-
-_TASKS = ("publish", "validate", "pseudonymise")
-_STAGES = {"recognising people": "recognising", "writing": "writing", "rewriting": "rewriting"}
+_TASKS = ("publish", "validate")
+_STAGES = {"recognising people": "recognising", "writing": "writing"}
 _SWITCHES = ("streams", "excluded", "reidentification", "thorough")
 
 
@@ -125,7 +83,6 @@ class _Publishing:
             if chosen.dataset.head.simulated:
                 notice(words("shell.simulation"))
             tag(facts(self._facts_of(chosen.dataset)), "dataset-facts")
-            self.pseudonyms = PseudonymsForm(self.page, chosen, self._pseudonymise)
             self.statements = StatementsForm(self.page, chosen.path, chosen.dataset.head)
             self._choices(chosen)
             name = ui.input(words("publish.name"), value=self._free_name(chosen.path.name)).props("maxlength=64")
@@ -162,12 +119,24 @@ class _Publishing:
         if chosen.columns:
             text(words("publish.columns"), classes="ps-dim")
             self._columns = {c: tag(ui.checkbox(c), f"column-{c}") for c in chosen.columns}
+        if chosen.own_codes:
+            codes = ", ".join(chosen.own_codes[:_MAX_CODES]) + (" …" if len(chosen.own_codes) > _MAX_CODES else "")
+            simulated = chosen.dataset is not None and chosen.dataset.head.simulated
+            tag(notice(words("publish.advice", codes=codes), "info" if simulated else "warning"), "advice")
+        self._pseudonyms = tag(ui.checkbox(words("publish.with_pseudonyms")), "with-pseudonyms")
+        self._pseudonyms.on_value_change(self._require_key)
+        text(words("publish.with_pseudonyms_about"), classes="ps-dim").style("margin: -12px 0 0 40px")
         self._keep = tag(ui.checkbox(words("publish.with_key")), "with-key")
         text(words("publish.with_key_about"), classes="ps-dim").style("margin: -12px 0 0 40px")
         field = ui.input(words("publish.key"), value=f"{chosen.path.name}.key").props("maxlength=64").classes("w-full")
         self._key = watched(tag(field.bind_visibility_from(self._keep, "value"), "key"))
         where = text(words("publish.key_place", folder=str(self.workspace.folder / KEYS)), classes="ps-dim")
         where.bind_visibility_from(self._keep, "value")
+
+    def _require_key(self) -> None:
+        """Keep the key if people get new codes, since it stores who has which code."""
+        self._keep.set_value(self._keep.value or self._pseudonyms.value)
+        self._keep.set_enabled(not self._pseudonyms.value)
 
     def _free_name(self, stem: str) -> str:
         return self.workspace.free_name(PACKAGES, plain_name(stem, "package"), "", ".zip")
@@ -199,6 +168,7 @@ class _Publishing:
                 **{key: bool(box.value) for key, box in self._switches.items()},
                 "columns": [name for name, box in self._columns.items() if box.value],
                 "key": str(key) if self._keep.value else "",
+                "pseudonyms": bool(self._pseudonyms.value),
             }
             await self.work.start("publish", spec)
 
@@ -208,19 +178,6 @@ class _Publishing:
         if name and path.parent == self.workspace.folder / KEYS and path.is_file():
             return self.workspace.inside(path)
         return self.workspace.new(KEYS, name)
-
-    async def _pseudonymise(self, name: str, key: str, words: list[str], drop_notes: bool) -> None:
-        chosen, form = self.dataset, self.pseudonyms
-        assert chosen is not None
-        self.page.say("")
-        with self.page.show_errors():
-            spec: dict[str, Any] = {"dataset": str(self.workspace.inside(chosen.path))}
-            with beside(self.words, form.name):
-                spec["place"] = str(self.workspace.new(DATASETS, name))
-            with beside(self.words, form.key):
-                spec["key"] = str(self._key_path(key))
-            if not self._ask_again(form.name, form.key):
-                await self.work.start("pseudonymise", spec | {"words": words, "drop_notes": drop_notes})
 
     def _ask_again(self, *fields: Field) -> bool:
         """Move the focus to the first of ``fields`` with an error; return whether there is one."""
@@ -242,9 +199,6 @@ class _Publishing:
         return f"{words(f'publish.stage_{known}')}{of}"
 
     async def _ended(self, job: StudioJob) -> None:
-        if job.task == "pseudonymise":
-            await self._renamed(job)
-            return
         name = Path(job.spec["place"]).name
         if job.task == "publish":
             good = bool(job.result["valid"])
@@ -255,14 +209,3 @@ class _Publishing:
         await self.packages.show(name.removesuffix(".zip") if job.task == "validate" else name)
         await self.packages.refresh()
         scroll_to("package")
-
-    async def _renamed(self, job: StudioJob) -> None:
-        result = job.result
-        self.page.say(self.words("publish.renamed", name=Path(job.spec["place"]).name, file=result["key"]), "good")
-        with self.page._messages, tag(ui.column().classes("w-full"), "findings"):
-            link = ui.link(self.words("publish.renamed_go"), address("publish", dataset=job.spec["place"]))
-            tag(link.classes("ps-link"), "go-renamed")
-            for finding in result["findings"]:
-                where = [str(finding[k]) for k in ("file", "line") if finding[k]]
-                times = [f"{finding['times']} ×"] if finding["times"] > 1 else []
-                notice(": ".join([*where, *times, self.words.sentence(Sentence.from_dict(finding["sentence"]))]))

@@ -24,7 +24,7 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.dataset import labelling
 from plushsense.dataset import trimming as trim
-from plushsense.dataset.files import current_stamp
+from plushsense.dataset.files import IndexStamp
 from plushsense.dataset.index import apply_marks, open_dataset
 from plushsense.dataset.marks import SUGGESTED as BY_SUGGESTION
 from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, apply_mark
@@ -111,7 +111,7 @@ class Review:
         self.prepared.begin(self.as_marked())
 
     def _open(self) -> None:
-        self._stamp = current_stamp(self.path)
+        self._stamp = IndexStamp.of(self.path)
         self.dataset = open_dataset(self.path)
         self.infos = {r.id: r for r in self.dataset.recordings}
         self._affects = {g.label: g.affect for g in self.dataset.gestures.gestures}
@@ -123,8 +123,9 @@ class Review:
     def renew(self) -> None:
         """Read the data set again if files were added; repeat the checks if files or decisions are new."""
         with self._lock:
-            now = current_stamp(self.path)
-            new = now | {"marks": ""} != self._stamp | {"marks": ""}
+            now = IndexStamp.of(self.path)
+            # What is compared are the raw files and the head.
+            new = (now.files, now.head) != (self._stamp.files, self._stamp.head)
             if new:
                 self._open()
                 self._read.clear()
@@ -434,7 +435,7 @@ class Review:
         Raises:
             DatasetError: for a gesture that is not in the gesture set.
         """
-        make = partial(labelling.relabel, self.dataset, identities, gesture, who, why)
+        make = partial(labelling.relabel_recordings, self.dataset, identities, gesture, who, why)
         return self._decide(visit, identities, "relabel", make)
 
     def accept_finding(self, visit: str, finding: Finding, who: str, why: str) -> int:
@@ -456,7 +457,7 @@ class Review:
             new = [LabelledStretch(stream, *rows, label)]
             make: Callable[[], object] = partial(labelling.label_stretches, self.dataset, new, who)
         else:
-            make = partial(labelling.unlabel, self.dataset, found, *rows, who)
+            make = partial(labelling.remove_labels, self.dataset, found.id, rows, who)
         return self._decide(visit, [stream], "label" if label else "unlabel", make, rows=rows)
 
     def _mark(self, visit: str, marks: Iterable[Mark]) -> int:

@@ -17,6 +17,7 @@ from plushsense.studio.app.shell import Page, add_style, button, focus, html, on
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.train.jobs import JobsSection, warning_texts
 from plushsense.studio.pages.train.requests import (
+    BUILT_IN,
     EVALUATE,
     KINDS,
     MAKE,
@@ -82,8 +83,8 @@ class TrainingForm:
         self._dataset = query_path(page.workspace, "dataset", self._datasets)
         self._values[TRAIN] |= {"context": ANYWHERE, "preset": "people", "fit_decisions": True}
         self._values[EVALUATE] |= {"split": SPLITS[0], "preset": "people"}
-        self._values[SWEEP] |= {"grid": PAPER}
-        self._values[SEARCH] |= {"grid": PAPER}
+        for kind, grid in BUILT_IN.items():
+            self._values[kind] |= {"grid": grid}
         # The job that computes an estimate, the request it is for, and the key of the displayed estimate.
         self._estimate_job: StudioJob | None = None
         self._estimate_request: JobRequest | None = None
@@ -205,7 +206,7 @@ class TrainingForm:
 
     def _of_grid(self) -> None:
         w = self._words
-        options = {PAPER: w("train.grids.paper" if self._kind == SWEEP else "train.grids.search")}
+        options = {BUILT_IN[self._kind]: w("train.grids.paper" if self._kind == SWEEP else "train.grids.search")}
         options |= {str(path): path.name for path in grids(self._page.workspace)}
         with ui.row().classes("w-full"):
             self._select("grid", options)
@@ -410,12 +411,12 @@ class TrainingForm:
         else:
             text = w(
                 "train.plan_search",
-                candidates=plan["candidates"],
-                rungs=", ".join(map(str, plan["rungs"])),
+                candidates=plan["halving"]["networks"],
+                rungs=", ".join(map(str, plan["halving"]["rungs"])),
                 left_out=len(plan["left_out"]),
                 split=plan["split"],
-                share=round(100 * plan["bound_share"]),
-                macs=_power(w, plan["bound_macs"]),
+                share=round(100 * plan["halving"]["bound_share"]),
+                macs=_power(w, plan["halving"]["bound_macs"]),
             )
         tag(ui.label(text), "plan-text")
         tag(ui.label(w("train.about", time=duration_text(w, plan["seconds"]))), "plan-time")

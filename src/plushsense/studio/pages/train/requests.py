@@ -21,7 +21,8 @@ MAKE, TRAIN, EVALUATE, SWEEP, SEARCH = "make", "train", "evaluate", "sweep", "se
 KINDS = (TRAIN, EVALUATE, SWEEP, SEARCH)
 MINUTES = (1, 600)
 """Shortest and longest budget of *Make a network*."""
-PAPER = "paper"
+PAPER, PEOPLE = "paper", "people"
+BUILT_IN = {SWEEP: PAPER, SEARCH: PEOPLE}
 GRIDS = "grids"
 SPLITS = ("leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5", "windows:holdout")
 
@@ -168,11 +169,12 @@ def _checked(settings: Mapping[str, Any]) -> RunConfig:
 
 
 def _of_grid(workspace: Workspace, kind: str, dataset: Path, given: Mapping[str, Any]) -> JobRequest:
-    grid = str(given.get("grid", PAPER))
-    if grid != PAPER:
+    built_in = BUILT_IN[kind]
+    grid = str(given.get("grid", built_in))
+    if grid != built_in:
         grid = str(workspace.inside(grid))
     changes: dict[str, Any] = {key: str(given[key]) for key in _CHANGES if key in given}
-    command = ["plushsense", kind, str(dataset), "--grid", grid, *_options(changes)]
+    command = ["plushsense", "sweep", str(dataset), "--grid", grid, *_options(changes)]
     if "seeds" in given:
         seeds = _whole("seeds", given["seeds"], 1)
         changes["seeds"] = list(range(seeds))
@@ -182,9 +184,9 @@ def _of_grid(workspace: Workspace, kind: str, dataset: Path, given: Mapping[str,
         limits: dict[str, Any] = {key: _whole(key, given[key], 1) for key in _LIMITS if key in given}
         if "share" in given:
             limits["share"] = _share(given["share"])
-        spec["asked"] = limits
-        command += _options(limits)
-    name = PAPER if grid == PAPER else Path(grid).stem
+        changes |= {**limits, "halving": True}
+        command += ["--halving", *_options(limits)]
+    name = grid if grid == built_in else Path(grid).stem
     title = f"{workspace.title(dataset)}: {name}"
     return JobRequest(kind, spec, title, shlex.join(command))
 

@@ -18,13 +18,13 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.store import HEAD
 from plushsense.evaluation.scores import Predictions, read_predictions
+from plushsense.experiments.sweep.folder import SUMMARY as SWEEP
+from plushsense.experiments.sweep.folder import TRIALS_CSV, prediction_files
 from plushsense.models.bundle import Bundle, known_people
 from plushsense.scoring import metrics
 from plushsense.studio.app.shell import AFFECT_SIGNS
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace, file_stamps
-from plushsense.trials.tables import SUMMARY as SWEEP
-from plushsense.trials.tables import TRIALS_CSV, prediction_files
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.preparation import WHOLE_PEOPLE
 from plushsense.workflow.reporting import LEARNING, PREDICTIONS, SCORES, load_evaluation
@@ -114,7 +114,7 @@ class ResultRow:
         interval: 95 % interval of the mean accuracy.
         people: accuracy of each person of an evaluation.
         rest: accuracy of recordings at rest if they are scored apart, as where whole people are left out.
-        learning: see `plushsense.trials.budget.learning_curve`.
+        learning: see `plushsense.workflow.budget.learning_curve`.
         apart: further values that are equal in comparable results: hash of the data set, classes, held-back people.
     """
 

@@ -1,16 +1,13 @@
-"""Implement ``plushsense pseudonymise DATASET OUT --key FILE`` and ``plushsense forget DATASET SUBJECT [--yes]``."""
+"""Implement ``plushsense forget DATASET SUBJECT [--yes]``."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from plushsense.cli.output import emit, say
-from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
-from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.workflow.datasets import Forgotten
@@ -18,39 +15,7 @@ if TYPE_CHECKING:
 _MOST_FILES = 10
 
 
-def run_pseudonymise(args: argparse.Namespace) -> int:
-    from plushsense.dataset.privacy.pseudonymise import pseudonymise
-
-    words: list[str] = []
-    if args.words:
-        try:
-            words = Path(args.words).read_text(encoding="utf-8-sig").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"--words '{args.words}' cannot be read ({error}): give a text file in UTF-8.") from None
-    done = pseudonymise(
-        args.dataset,
-        args.out,
-        key=args.key,
-        words=words,
-        drop_notes=args.drop_notes,
-        progress=ProgressReporter("rewriting"),
-    )
-    result = done.to_dict()
-    if not args.json:
-        for finding in done.findings:
-            where = f"{finding['file']}{':' + str(finding['line']) if finding['line'] else ''}: "
-            say(f"finding: {where if finding['file'] else ''}{finding['message']}")
-    emit(
-        args,
-        result,
-        f"{args.out}: {plural(result['recordings'], 'recording')} of {plural(result['subjects'], 'person')} "
-        f"under pseudonyms, {plural(result['files'], 'file')}; {plural(len(done.findings), 'finding')} to read.\n"
-        f"The key is {args.key}: store it apart from the data, and never publish it.",
-    )
-    return 0
-
-
-def run_forget(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     from plushsense.workflow.datasets import forget
 
     result = forget(args.dataset, args.subject, bundles=args.bundles)

@@ -8,13 +8,14 @@ number of epochs needs its own training.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from plushsense.core.errors import ArchError, BadInput, ConfigError, nearest
 from plushsense.core.layouts import Layout
@@ -37,17 +38,30 @@ from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import DEVICES, PRESETS, TrainSpec
 from plushsense.windows.cut import CONTEXTS, WindowSpec
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-
 FULL: Literal["full"] = "full"
 # Time between decisions, 50 ms as in all of PlushSense.
 _STEP_S = 0.05
 # Training settings that a grid may change; None keeps the value of the preset.
 GRID_TRAINING = ("learning_rate", "halve_every", "patience", "augment", "turn_deg", "scaling", "weight_decay")
+# Limits on the networks: the property of a network, and its unit.
+LIMITS: dict[str, tuple[str, str]] = {
+    "max_parameters": ("parameters", "parameters"),
+    "max_state_bytes": ("state_bytes_int8", "bytes of state"),
+    "max_macs_per_step": ("macs_per_step", "MAC a step"),
+}
 # Settings that earlier grids do not have.
-_NEW = ("augment", "scaling", "weight_decay")
+_NEW = ("augment", "scaling", "weight_decay", "halving", "share", "eta", *LIMITS)
+
+
+class Excess(NamedTuple):
+    """A limit that a network exceeds, and its value."""
+
+    value: int
+    limit: int
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.value:,} {self.unit}, {self.value - self.limit:,} over {self.limit:,}"
 
 
 @dataclass(frozen=True)
@@ -86,6 +100,14 @@ class GridSpec:
         weight_decay: factor of the L2 regularisation, as in a configuration file (0 to 1; default: by the preset).
         device: what computes; ``auto``: a graphics card with CUDA if there is one (one of `DEVICES`).
         threads: threads of the processor for one training (from 1).
+        max_parameters: networks with more parameters are left out before anything runs (from 1; default: no limit).
+        max_state_bytes: the same for the bytes of state of streaming in 8 bits (from 1; default: no limit).
+        max_macs_per_step: the same for the multiplications in a step of 50 ms (from 1; default: no limit).
+        halving: whether to drop the worse networks after each of ``epochs`` but the last (successive halving).
+        share: with halving, the limit on the cost, as a share of the cost of training all networks to the last of
+            ``epochs`` (above 0 to 1; default: a quarter, or if that cannot pay for one complete training, the cost of
+            the first number of epochs and of training two networks to the end).
+        eta: with halving, one in this many networks continues, but at least two, if the cost allows (above 1).
     """
 
     name: str = "grid"
@@ -112,6 +134,12 @@ class GridSpec:
     weight_decay: float | None = None
     device: str = "auto"
     threads: int = 1
+    max_parameters: int | None = None
+    max_state_bytes: int | None = None
+    max_macs_per_step: int | None = None
+    halving: bool = False
+    share: float | None = None
+    eta: float = 2.0
 
     @property
     def training(self) -> TrainSpec:
@@ -124,18 +152,44 @@ class GridSpec:
         """The settings of the windows."""
         return WindowSpec(window_s=self.window_s, step_s=self.step_s, context=self.context)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON, without newer settings that are None, which keeps the ids of old grids."""
-        return {key: value for key, value in asdict(self).items() if key not in _NEW or value is not None}
+    @property
+    def schedules(self) -> list[tuple[int, ...]]:
+        """The numbers of epochs that each training of a network covers."""
+        together = self.training.patience is None and not self.halving
+        return [self.epochs] if together else [(epochs,) for epochs in self.epochs]
+
+    def exceeded(self, arch: Arch) -> list[Excess]:
+        """Return the limits that a network exceeds."""
+        found = []
+        for key, (name, unit) in LIMITS.items():
+            value, limit = getattr(arch, name), getattr(self, key)
+            if limit is not None and value > limit:
+                found.append(Excess(value, limit, unit))
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, without newer settings that have their defaults, which keeps the ids of old grids."""
+        usual = {field.name: field.default for field in fields(self)}
+        return {key: value for key, value in asdict(self).items() if key not in _NEW or value != usual[key]}
 
 
 # 13 architectures × 4 filter sets × 3 epochs × 3 batches = 468 trials: "paper" as its section 3.6 describes them, and
 # "scripts" as the authors' published experiment trains them. Its weight decay is MATLAB's default, which the paper does
-# not mention.
+# not mention. "people" has the same networks, trained for live use, to find a small one with halving.
 GRIDS: dict[str, GridSpec] = {
     "paper": GridSpec(name="paper", context="rows"),
     "scripts": GridSpec(
         name="scripts", context="rows", split="windows:file-order", norm="layer", scaling="none", weight_decay=1e-4
+    ),
+    "people": GridSpec(
+        name="people",
+        epochs=(4, 15, 60),
+        batches=(64,),
+        split="by-subject:5",
+        preset="people",
+        padding="stream",
+        context="stream",
+        classes="shared",
     ),
 }
 # The network that the paper chose (section 3.6.2 and Figure 10), which was best with 250 epochs and batches of 64, and
@@ -144,39 +198,13 @@ CHOSEN = ("14d1_39d2_41d4", slashed(DEFAULT_FILTERS))
 SECOND = ("19d1_19d2_19d4_17d8", "4/6/8/8")
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One network, trained for ``epochs`` in batches of ``batch`` windows ("full": all windows in one batch)."""
-
-    arch: Arch
-    filter_set: tuple[int, ...]
-    epochs: int
-    batch: int | str
-
-
-@dataclass(frozen=True)
-class Training:
-    """The trials that one training covers; they differ only in their epochs, the shortest first."""
-
-    trials: tuple[Trial, ...]
-
-    @property
-    def epochs(self) -> tuple[int, ...]:
-        """The numbers of epochs after which the training is scored."""
-        return tuple(trial.epochs for trial in self.trials)
-
-
-def trainings(grid: GridSpec, layout: Layout, classes: int) -> list[Training]:
-    """Return the trainings that cover all trials of a grid, which must have no `problems`."""
-    planned = []
-    nested = grid.training.patience is None
-    for symbol in grid.architectures:
-        for filters in grid.filters:
-            arch = _network(grid, symbol, filters, layout, classes)
-            for batch in grid.batches:
-                trials = tuple(Trial(arch, filters, epochs, batch) for epochs in grid.epochs)
-                planned += [Training(trials)] if nested else [Training((trial,)) for trial in trials]
-    return planned
+def networks(grid: GridSpec, layout: Layout, classes: int) -> list[tuple[Arch, tuple[int, ...]]]:
+    """Return each network of a grid, which must have no `problems`, with its filter set."""
+    return [
+        (_network(grid, symbol, filters, layout, classes), filters)
+        for symbol in grid.architectures
+        for filters in grid.filters
+    ]
 
 
 def _network(grid: GridSpec, symbol: str, filters: Sequence[int], layout: Layout, classes: int) -> Arch:
@@ -269,6 +297,25 @@ def _of_settings(grid: GridSpec) -> list[str]:
     wrong += _refused(lambda: parse_split(grid.split))
     if grid.split_seed < 0:
         wrong.append(f"split_seed is {grid.split_seed}: accepted are whole numbers from 0.")
+    for key in LIMITS:
+        limit = getattr(grid, key)
+        if limit is not None and limit < 1:
+            wrong.append(f"{key} is {limit}: accepted are whole numbers from 1.")
+    return wrong + _of_halving(grid)
+
+
+def _of_halving(grid: GridSpec) -> list[str]:
+    wrong = []
+    if grid.share is not None and not 0.0 < grid.share <= 1.0:
+        wrong.append(f"The share {grid.share:g} cannot be used: accepted is above 0, up to 1.")
+    if not (math.isfinite(grid.eta) and grid.eta > 1.0):
+        wrong.append(f"eta is {grid.eta:g}: accepted is above 1.")
+    patience = grid.patience or (PRESETS[grid.preset].patience if grid.preset in PRESETS else None)
+    if grid.halving and patience is not None:
+        wrong.append(
+            f"Trainings that stop early (patience {patience}, preset {grid.preset}) cannot be continued after halving: "
+            "use the preset people or search, without patience."
+        )
     return wrong
 
 
@@ -350,12 +397,6 @@ def first_line(cause: Exception) -> str:
     return (str(cause) or type(cause).__name__).splitlines()[0]
 
 
-# The tables of a grid's file; `experiments.search.halving` reads the table "search".
-TABLES = ("grid", "search")
-
-Spec = TypeVar("Spec", bound="DataclassInstance")
-
-
 def load_grid(
     grid: GridSpec | str | os.PathLike[str], changes: Mapping[str, Any] | None = None
 ) -> tuple[GridSpec, list[str]]:
@@ -377,45 +418,41 @@ def load_grid(
         if path in GRIDS:
             grid = GRIDS[path]
         else:
-            tables, wrong = grid_tables(path)
-            grid, more = over(GridSpec(name=Path(path).stem), tables["grid"], f"[grid] in '{path}'")
+            table, wrong = _read_table(Path(path))
+            grid, more = _changed(GridSpec(name=Path(path).stem), table, f"[grid] in '{path}'")
             wrong += more
-    grid, more = over(grid, changes or {}, "the grid")
+    changes = changes or {}
+    grid, more = _changed(grid, changes, "the grid")
+    if not grid.halving and any(changes.get(key) is not None for key in ("share", "eta")):
+        more.append("share and eta are for halving only: give --halving (in a file: halving = true), too.")
     return grid, wrong + more
 
 
-def grid_tables(path: str | Path) -> tuple[dict[str, Mapping[str, Any]], list[str]]:
-    """Return the tables of a grid's file by name, and a sentence for each one that is unknown, missing or not a table.
-
-    Raises:
-        ConfigError: for a file that is missing or not TOML.
-    """
-    if Path(path).suffix != ".toml" and not Path(path).is_file():
+def _read_table(path: Path) -> tuple[Mapping[str, Any], list[str]]:
+    """Return the table of a grid's file, and a sentence for each other one, or if there is none."""
+    if path.suffix != ".toml" and not path.is_file():
         raise ConfigError(
             f"Unknown grid '{path}': accepted are {', '.join(GRIDS)} and the path of a TOML file."
             f"{nearest(str(path), GRIDS)}"
         )
-    content = read_toml(Path(path), "grid", ConfigError)
-    wrong = [unknown_key(key, TABLES, f"'{path}'") for key in content if key not in TABLES]
-    tables: dict[str, Mapping[str, Any]] = {name: {} for name in TABLES}
-    for name in tables:
-        if isinstance(content.get(name), Mapping):
-            tables[name] = content[name]
-        elif name in content or name == "grid":
-            wrong.append(f"'{path}' has no table [{name}]: write  [{name}]  and its keys below.")
-    return tables, wrong
+    content = read_toml(path, "grid", ConfigError)
+    wrong = [unknown_key(key, ("grid",), f"'{path}'") for key in content if key != "grid"]
+    table = content.get("grid")
+    if isinstance(table, Mapping):
+        return table, wrong
+    return {}, [*wrong, f"'{path}' has no table [grid]: write  [grid]  and its keys below."]
 
 
-def over(spec: Spec, table: Mapping[str, Any], where: str) -> tuple[Spec, list[str]]:
-    """Return ``spec`` with the values of ``table``, and a message for each wrong key or value.
+def _changed(grid: GridSpec, table: Mapping[str, Any], where: str) -> tuple[GridSpec, list[str]]:
+    """Return ``grid`` with the values of ``table``, and a message for each wrong key or value.
 
     Values may be text as on the command line, with commas between the items of a list; None keeps the value of
-    ``spec``. If one item of a list is wrong, the others are kept, so that their problems are found as well.
+    ``grid``. If one item of a list is wrong, the others are kept, so that their problems are found as well.
     """
-    kinds = get_type_hints(type(spec))
+    kinds = get_type_hints(GridSpec)
     parsed = {key: _from_text(key, value, kinds.get(key)) for key, value in table.items() if value is not None}
-    values, wrong = check_table(parsed, type(spec), where)
-    return replace(spec, **values), wrong
+    values, wrong = check_table(parsed, GridSpec, where)
+    return replace(grid, **values), wrong
 
 
 def _from_text(key: str, value: Any, kind: Any) -> Any:

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from plushsense.dataset.store import Dataset
-from plushsense.trials import budget
-from plushsense.trials.budget import TrainingCost, choose_plan, curve_sizes, learning_curve, make_network, plan_s
+from plushsense.workflow import budget
+from plushsense.workflow.budget import TrainingCost, choose_plan, curve_sizes, learning_curve, make_network, plan_s
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.reporting import load_evaluation
 
@@ -49,7 +49,8 @@ def test_a_training_as_long_as_estimated_cuts_no_folds(
     done.save = lambda path: path
     monkeypatch.setattr(budget, "train", lambda *_, **__: done)
     nothing = lambda _: None  # noqa: E731
-    _, training_s = budget._train(dataset, from_settings(), tmp_path / "n", 1.0, True, nothing, nothing)
+    making = budget._Making(dataset, tmp_path / "n", 600, from_settings(), nothing, nothing)
+    _, training_s = making._train(plan)
     left_s = plan_s(cost, plan) - cost.training_s(2)
     assert budget._adjusted(plan, cost, training_s, left_s + 1e-9) == plan
 
@@ -60,12 +61,12 @@ def test_what_more_people_would_add_has_an_uncertainty_or_is_not_named() -> None
     found = learning_curve(points)
     assert found is not None
     # Each doubling adds a tenth to everybody: two more than 16 add a fraction of it, and all agree.
-    assert found["gain"] == pytest.approx(0.1 * 0.16993, rel=1e-3)
-    assert found["ci95"] == pytest.approx([found["gain"]] * 2)
-    assert [point["people"] for point in found["points"]] == [4, 8, 16]
+    assert found.gain == pytest.approx(0.1 * 0.16993, rel=1e-3)
+    assert found.ci95 == pytest.approx([found.gain] * 2)
+    assert [people for people, _ in found.points] == [4, 8, 16]
     noisy = {m: {p: 0.3 + 0.2 * ((i + k) % 2) for i, p in enumerate(people)} for k, m in enumerate((4, 8, 16))}
     unsure = learning_curve(noisy)
-    assert unsure is not None and unsure["ci95"][0] <= 0 <= unsure["ci95"][1]
+    assert unsure is not None and unsure.ci95[0] <= 0 <= unsure.ci95[1]
     assert learning_curve({16: points[16]}) is None
     assert learning_curve({m: dict(list(row.items())[:2]) for m, row in points.items()}) is None
 
@@ -95,13 +96,13 @@ def test_it_resumes_with_the_same_plan_and_trains_nothing_twice(
     assert [at.share for at in seen] == sorted(at.share for at in seen) and seen[-1].share == pytest.approx(1.0)
     assert {at.bundle for at in seen} == {str(tmp_path / "n.plush")}
     assert (tmp_path / "n.plush").read_bytes() == first
-    assert done["plan"]["split"] == "leave-one-subject-out" and done["cut"] == []
-    assert done["plan"]["workers"] == 1, "processes of their own would take longer than the folds"
-    stored = load_evaluation(done["evaluation"])
-    assert stored["learning"] == done["learning"] and len(stored["learning"]["points"]) == 3
+    assert done.plan.split == "leave-one-subject-out" and done.cut == ()
+    assert done.plan.workers == 1, "processes of their own would take longer than the folds"
+    stored = load_evaluation(done.evaluation)
+    assert stored["learning"] == done.learning.to_json() and len(stored["learning"]["points"]) == 3
     # The last point of the curve is the score of the evaluation itself.
     assert stored["learning"]["points"][-1]["accuracy"] == pytest.approx(stored["accuracy"]["mean"])
     # A further network of the same name does not replace it.
     other = make_network(**made | {"config": replace(config, training=replace(config.training, seed=1))})
-    assert Path(other["bundle"]).name == "n 2.plush"
+    assert other.bundle.name == "n 2.plush"
     assert (tmp_path / "n.plush").read_bytes() == first

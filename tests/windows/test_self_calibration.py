@@ -18,11 +18,11 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.machine import FrameReader, Sample
-from plushsense.windows import calibration
-from plushsense.windows.calibration import UNIT, SelfCalibration
+from plushsense.windows import self_calibration
 from plushsense.windows.clock import Segment, resample
 from plushsense.windows.cut import cut_windows
 from plushsense.windows.features import network_inputs
+from plushsense.windows.self_calibration import UNIT, SelfCalibration
 from plushsense.windows.sessions import SessionReader
 
 PLAIN = load_layout("accel-3")
@@ -186,11 +186,11 @@ def test_a_long_stream_halves_its_sums_and_reads_on(monkeypatch: pytest.MonkeyPa
     """What is asked for is a ratio of sums, so that halving all of them changes nothing while the readings repeat."""
     x = np.tile(readings(1500, 3), (6, 1))
     long = SelfCalibration(LAYOUT).apply(x)
-    monkeypatch.setattr(calibration, "MOST_WEIGHT", 1 << 16)
+    monkeypatch.setattr(self_calibration, "MOST_WEIGHT", 1 << 16)
     halving = SelfCalibration(LAYOUT)
     out = halving.apply(x)
     (fit,) = halving._fits
-    assert isinstance(fit, calibration.SphereFit) and 1 << 14 < fit._weight <= 1 << 16
+    assert isinstance(fit, self_calibration.SphereFit) and 1 << 14 < fit._weight <= 1 << 16
     assert np.abs(out - long)[-1500:].mean() < 0.01 * UNIT and not np.array_equal(out, long)
     one_by_one = SelfCalibration(LAYOUT)
     assert [one_by_one.push(row) for row in x.tolist()] == out.tolist()

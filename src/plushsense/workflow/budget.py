@@ -23,16 +23,19 @@ from plushsense.core.errors import PlushSenseError, python_warning
 from plushsense.core.files import free_path, write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.scores import Scores
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
 from plushsense.scoring.metrics import summary
-from plushsense.trials.estimate import preview_evaluation
+from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate_run, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import (
+    Run,
     Warn,
     count_people,
     prepare,
@@ -147,7 +150,28 @@ def plan_s(cost: TrainingCost, plan: BudgetPlan) -> float:
     return cost.training_s(plan.epochs) + sum(cost.evaluation_s(plan.epochs, plan.folds, s) for s in shares)
 
 
-def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int = MORE_PEOPLE) -> dict[str, Any] | None:
+@dataclass(frozen=True)
+class LearningCurve:
+    """How the accuracy grows with the number of people to train on.
+
+    Attributes:
+        points: (number of people, mean accuracy), ascending.
+        more: number of further people.
+        gain: what they would add to the accuracy, with its 95 % interval ``ci95``.
+    """
+
+    points: tuple[tuple[int, float], ...]
+    more: int
+    gain: float
+    ci95: tuple[float, float]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        points = [{"people": people, "accuracy": accuracy} for people, accuracy in self.points]
+        return asdict(self) | {"points": points, "ci95": list(self.ci95)}
+
+
+def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int = MORE_PEOPLE) -> LearningCurve | None:
     """Estimate from a learning curve what ``more`` people to train on would add to the accuracy.
 
     For each person, a line is fitted to the accuracy over the logarithm of the number of training people. The gain is
@@ -157,8 +181,7 @@ def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int =
         points: accuracy of each person, by the number of people that were trained on.
 
     Returns:
-        ``points`` (people, accuracy: mean), ``more``, ``gain`` and ``ci95``; None with fewer than two sizes or three
-        people, from which no uncertainty follows.
+        the curve; None with fewer than two sizes or three people, from which no uncertainty follows.
     """
     sizes = sorted(points)
     people = [p for p in points[sizes[-1]] if all(points[m].get(p) is not None for m in sizes)] if sizes else []
@@ -169,12 +192,10 @@ def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int =
     slopes = (table - table.mean(axis=1, keepdims=True)) @ (x - x.mean()) / ((x - x.mean()) ** 2).sum()
     step = math.log((sizes[-1] + more) / sizes[-1])
     gain = summary(slopes * step)
-    return {
-        "points": [{"people": m, "accuracy": float(table[:, k].mean())} for k, m in enumerate(sizes)],
-        "more": more,
-        "gain": gain["mean"],
-        "ci95": gain["ci95"],
-    }
+    means = tuple((m, float(table[:, k].mean())) for k, m in enumerate(sizes))
+    if gain.mean is None or gain.ci95 is None:
+        return None
+    return LearningCurve(means, more, gain.mean, gain.ci95)
 
 
 @dataclass(frozen=True)
@@ -197,6 +218,35 @@ class BudgetProgress:
 Reporter = Callable[[BudgetProgress], None]
 
 
+@dataclass(frozen=True)
+class BudgetResult:
+    """A network that was made within a budget of time.
+
+    Attributes:
+        bundle: path of the network.
+        evaluation: folder of its evaluation.
+        report: page of the evaluation.
+        learning: None if it was not measured.
+        cut: what did not fit into the budget, as dictionaries with a ``kind`` (``epochs``, ``folds``, ``learning``,
+            ``longer``).
+    """
+
+    bundle: Path
+    evaluation: Path
+    report: Path
+    plan: BudgetPlan
+    learning: LearningCurve | None
+    cut: tuple[Mapping[str, Any], ...]
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        paths = {name: str(getattr(self, name)) for name in ("bundle", "evaluation", "report")}
+        learning = None if self.learning is None else self.learning.to_json()
+        seconds = round(self.seconds, 1)
+        return paths | {"plan": asdict(self.plan), "learning": learning, "cut": list(self.cut), "seconds": seconds}
+
+
 def make_network(
     dataset: Dataset | str | os.PathLike[str],
     out: str | os.PathLike[str],
@@ -205,95 +255,127 @@ def make_network(
     config: RunConfig | None = None,
     progress: Reporter = lambda at: None,
     warn: Warn = python_warning,
-) -> dict[str, Any]:
+) -> BudgetResult:
     """Train a network, save it as the bundle ``out``, and evaluate it on people left out, in about ``budget_s``.
 
     If there is another file ``out``, the bundle gets a number.
 
     By default it is trained for live use (context "anywhere") if the data set has sessions, and with the defaults of
     the preset "people" otherwise. With fewer than three people, recordings are left out instead.
-
-    Returns:
-        ``bundle``; ``evaluation``, its folder; ``report``; ``plan``; ``learning`` (see `learning_curve`) or None;
-        ``cut``, a list of what did not fit into the budget (``epochs``, ``folds``, ``learning``, ``longer``);
-        ``seconds``.
     """
-    began = time.monotonic()
     dataset, out = as_dataset(dataset), Path(out)
     check_folder(out.parent, "A bundle")
     if config is None:
         streams = any(recording.stream_row >= 0 for recording in dataset.used)
         config = from_settings(context=ANYWHERE) if streams else from_settings()
-    run = prepare(dataset, config)
-    refuse_hard_negatives(run)
-    again = refits(config, count_people(dataset))
-    networks = 1 + again
-    # A resumed run must not choose other folds because the computer is faster or slower than before.
-    journal = journal_of(dataset, "budgets")
-    key = job_id({"evaluation": run.id, "out": out.name, "seconds": budget_s})
-    stored = journal.find(key)
-    cost = None
-    if stored is None:
-        cost = _measured(dataset, config, networks)
-        plan = choose_plan(cost, count_people(dataset), config.training.epochs, _USED * budget_s)
+    return _Making(dataset, out, budget_s, config, progress, warn).run()
+
+
+class _Making:
+    """A run of `make_network`."""
+
+    def __init__(
+        self, dataset: Dataset, out: Path, budget_s: float, config: RunConfig, progress: Reporter, warn: Warn
+    ) -> None:
+        self._began = time.monotonic()
+        self._dataset, self._out, self._config = dataset, out, config
+        self._budget_s, self._progress, self._warn = budget_s, progress, warn
+        run = prepare(dataset, config)
+        refuse_hard_negatives(run)
+        self._again = refits(config, count_people(dataset))
+        self._networks = 1 + self._again
+        # A resumed run must not choose other folds because the computer is faster or slower than before.
+        self._journal = journal_of(dataset, "budgets")
+        self._key = job_id({"evaluation": run.id, "out": out.name, "seconds": budget_s})
+
+    @property
+    def _seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    def run(self) -> BudgetResult:
+        stored = self._journal.find(self._key)
+        if stored is None:
+            plan, bundle = self._begin()
+        else:
+            plan = BudgetPlan(**{**stored["plan"], "sizes": tuple(stored["plan"]["sizes"])})
+            bundle = _saved_bundle(self._out.parent, stored["bundle"]) or self._train(plan)[0]
+            self._store(plan, bundle.name)
+        run = prepare(self._dataset, _planned(self._config, plan), self._warn)
+        folder = self._dataset.path / "evaluations" / run.name
+        learning = self._evaluate(plan, run, folder, bundle, resumed=stored is not None)
+        if learning is not None:
+            with self._dataset.generation.writing():
+                write_file(folder / LEARNING, json.dumps(learning.to_json()))
+        report = write_report(folder / PAGE, self._dataset, [folder])
+        self._journal.discard(self._key)
+        cut = _cut(plan, learning, self._seconds, self._budget_s)
+        return BudgetResult(bundle, folder, report, plan, learning, cut, self._seconds)
+
+    def _begin(self) -> tuple[BudgetPlan, Path]:
+        """Plan and train; return the plan, which the measured time may have changed, and the path of the network."""
+        seconds = _USED * self._budget_s
+        cost = _measured(self._dataset, self._config, self._networks)
+        plan = choose_plan(cost, count_people(self._dataset), self._config.training.epochs, seconds)
         if cost.side_by_side * cost.evaluation_s(plan.epochs, plan.folds) < _START_S:
             plan = replace(plan, workers=1)
-        journal.save(key, {"plan": asdict(plan), "bundle": ""})
-    else:
-        plan = BudgetPlan(**{**stored["plan"], "sizes": tuple(stored["plan"]["sizes"])})
-    config = _planned(config, plan)
-    whole = sum(_work(plan, networks))
-    bundle = _saved_bundle(out.parent, stored["bundle"]) if stored is not None else None
-    if bundle is None:
-        bundle, training_s = _train(dataset, config, out, whole, again, progress, warn)
-        if cost is not None:
-            plan = _adjusted(plan, cost, training_s, _USED * budget_s - (time.monotonic() - began))
-            config, whole = _planned(config, plan), sum(_work(plan, networks))
-        journal.save(key, {"plan": asdict(plan), "bundle": bundle.name})
-    run = prepare(dataset, config, warn)
-    evaluation = dataset.path / "evaluations" / run.name
-    before = float(networks)
-    started = time.monotonic()
-    result = evaluate_run(
-        run,
-        out=evaluation,
-        progress=_folds(EVALUATING, before, plan, 1.0, whole, bundle, progress),
-        warn=warn,
-    )
-    evaluation_s = time.monotonic() - started
-    before += plan.folds - 1
-    points = {plan.trained_people: _accuracies(result.table)}
-    for size in plan.sizes:
-        share = size / plan.trained_people
-        left_s = budget_s - (time.monotonic() - began)
-        if stored is None and share * evaluation_s > left_s:
-            break
-        reported = _folds(LEARNING_CURVE, before, plan, share, whole, bundle, progress)
-        smaller = evaluate_run(run, training_people=size, progress=reported, warn=silent)
-        points[size] = _accuracies(smaller.table)
-        before += (plan.folds - 1) * share
-    learning = learning_curve(points)
-    if learning is not None:
-        with dataset.generation.writing():
-            write_file(evaluation / LEARNING, json.dumps(learning))
-    report = write_report(evaluation / PAGE, dataset, [evaluation])
-    journal.discard(key)
-    seconds = time.monotonic() - began
-    return {
-        "bundle": str(bundle),
-        "evaluation": str(evaluation),
-        "report": str(report),
-        "plan": asdict(plan),
-        "learning": learning,
-        "cut": _cut(plan, learning, seconds, budget_s),
-        "seconds": round(seconds, 1),
-    }
+        self._store(plan, "")
+        bundle, training_s = self._train(plan)
+        plan = _adjusted(plan, cost, training_s, seconds - self._seconds)
+        self._store(plan, bundle.name)
+        return plan, bundle
+
+    def _store(self, plan: BudgetPlan, bundle: str) -> None:
+        self._journal.save(self._key, {"plan": asdict(plan), "bundle": bundle})
+
+    def _train(self, plan: BudgetPlan) -> tuple[Path, float]:
+        """Train the network and save it; return its path, and the seconds that one training on everybody took."""
+        whole, again, progress = sum(_work(plan, self._networks)), self._again, self._progress
+
+        def epoch_done(epoch: int, epochs: int, row: EpochRow) -> None:
+            second = str(row.get("what", "")).startswith(REFIT)
+            done = epoch / epochs + second
+            progress(BudgetProgress(TRAINING, done / whole, {**row, "epoch": epoch, "epochs": epochs}))
+            if epoch == epochs and second == again:
+                progress(BudgetProgress(DECIDING, done / whole, {}))
+
+        config, dataset = _planned(self._config, plan), self._dataset
+        done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=self._warn)
+        return done.save(free_path(self._out, done.bundle.to_bytes())), done.seconds / (1 + again)
+
+    def _evaluate(self, plan: BudgetPlan, run: Run, out: Path, bundle: Path, resumed: bool) -> LearningCurve | None:
+        """Evaluate on all people, then on fewer while the time allows."""
+        before, whole = float(self._networks), sum(_work(plan, self._networks))
+
+        def reported(stage: str, share: float) -> Callable[[JobProgress], None]:
+            base = before
+
+            def fold_done(at: JobProgress) -> None:
+                done = base + at.share * (plan.folds - 1) * share
+                row = {"done": at.done, "folds": at.total}
+                self._progress(BudgetProgress(stage, done / whole, row, str(bundle)))
+
+            return fold_done
+
+        started = time.monotonic()
+        result = evaluate_run(run, out=out, progress=reported(EVALUATING, 1.0), warn=self._warn)
+        evaluation_s = time.monotonic() - started
+        before += plan.folds - 1
+        points = {plan.trained_people: _accuracies(result.scores)}
+        for size in plan.sizes:
+            share = size / plan.trained_people
+            if not resumed and share * evaluation_s > self._budget_s - self._seconds:
+                break
+            progress = reported(LEARNING_CURVE, share)
+            smaller = evaluate_run(run, training_people=size, progress=progress, warn=silent)
+            points[size] = _accuracies(smaller.scores)
+            before += (plan.folds - 1) * share
+        return learning_curve(points)
 
 
 def _measured(dataset: Dataset, config: RunConfig, networks: int) -> TrainingCost:
     split = "leave-one-subject-out" if count_people(dataset) >= _PEOPLE_FOR_SPLIT else _KNOWN_PEOPLE
     seen = preview_evaluation(dataset, replace(config, evaluation=replace(config.evaluation, split=split)))
-    return TrainingCost(seen["window_epoch_s"], seen["windows"], config.evaluation.processes, networks)
+    return TrainingCost(seen.window_epoch_s, seen.windows, config.evaluation.processes, networks)
 
 
 def _planned(config: RunConfig, plan: BudgetPlan) -> RunConfig:
@@ -333,45 +415,13 @@ def _work(plan: BudgetPlan, networks: int) -> list[float]:
     return [float(networks), evaluation, *(evaluation * size / plan.trained_people for size in plan.sizes)]
 
 
-def _train(
-    dataset: Dataset,
-    config: RunConfig,
-    out: Path,
-    whole: float,
-    again: bool,
-    progress: Reporter,
-    warn: Warn,
-) -> tuple[Path, float]:
-    """Train the network and save it; return its path, and the seconds that one training on everybody took."""
-
-    def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
-        second = str(row.get("what", "")).startswith(REFIT)
-        done = epoch / epochs + second
-        progress(BudgetProgress(TRAINING, done / whole, row | {"epoch": epoch, "epochs": epochs}))
-        if epoch == epochs and second == again:
-            progress(BudgetProgress(DECIDING, done / whole, {}))
-
-    done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)
-    return done.save(free_path(out, done.bundle.to_bytes())), done.seconds / (1 + again)
+def _accuracies(scores: Scores) -> dict[str, float | None]:
+    return {row.subject: row.metrics["accuracy"] for row in scores.subjects}
 
 
-def _folds(
-    stage: str, before: float, plan: BudgetPlan, share: float, whole: float, bundle: Path, progress: Reporter
-) -> Callable[[JobProgress], None]:
-    def fold_done(at: JobProgress) -> None:
-        done = before + at.share * (plan.folds - 1) * share
-        progress(BudgetProgress(stage, done / whole, {"done": at.done, "folds": at.total}, str(bundle)))
-
-    return fold_done
-
-
-def _accuracies(table: Mapping[str, Any]) -> dict[str, float | None]:
-    return {row["subject"]: row["accuracy"] for row in table["subjects"]}
-
-
-def _cut(plan: BudgetPlan, learning: object, seconds: float, budget_s: float) -> list[dict[str, Any]]:
-    """Return what did not fit into the budget, as dictionaries with a ``kind``."""
-    cut: list[dict[str, Any]] = []
+def _cut(plan: BudgetPlan, learning: object, seconds: float, budget_s: float) -> tuple[Mapping[str, Any], ...]:
+    """Return what did not fit into the budget, as in `BudgetResult`."""
+    cut: list[Mapping[str, Any]] = []
     if plan.epochs < plan.usual_epochs:
         cut.append({"kind": "epochs", "epochs": plan.epochs, "usual": plan.usual_epochs})
     if plan.people != plan.folds and plan.people >= _PEOPLE_FOR_SPLIT:
@@ -380,4 +430,4 @@ def _cut(plan: BudgetPlan, learning: object, seconds: float, budget_s: float) ->
         cut.append({"kind": "learning"})
     if seconds > budget_s:
         cut.append({"kind": "longer", "minutes": math.ceil(seconds / 60), "budget": round(budget_s / 60)})
-    return cut
+    return tuple(cut)

@@ -1,0 +1,442 @@
+"""Scan a folder of recordings: kind, person and session of each file.
+
+Three folder structures are supported: sessions of PlushSense's recorder, folders of the GestureRecorder (by person, or
+by label after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a session, the
+name of the nearest folder is the person.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from plushsense.core.errors import BadInput, ConfigError, DatasetError
+from plushsense.core.gestures import NOBODY, GestureSet, plain_label
+from plushsense.core.layouts import Layout
+from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
+from plushsense.core.sentences import Sentence, plural
+from plushsense.dataset.importing.sources import (
+    COMPANIONS,
+    LEFT_OUT,
+    SHOWN,
+    ScanSpec,
+    SourceFile,
+    SourceScan,
+    is_simulation,
+    printable_path,
+    source_files,
+    split_regular_files,
+)
+from plushsense.dataset.importing.truncation import find_truncation
+from plushsense.dataset.importing.xdf import convert_xdf, is_xdf
+from plushsense.dataset.store import RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo
+from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
+
+_ASK = (
+    "import from the folder that holds one folder a person, or name the people with --subjects map.csv (file,subject)"
+)
+
+
+def scan_folder(source: Path, spec: ScanSpec, *, around: Path | None = None) -> SourceScan:
+    """Scan a folder for sessions of PlushSense's recorder, XDF files, and recordings by the folder structure.
+
+    ``around`` is the folder of the zip if ``source`` was unpacked from one; a mark of a simulation counts there too.
+    """
+    all_files = source_files(source)
+    simulated = is_simulation(around or source, all_files)
+    regular, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
+    script = find_truncation(source, regular)
+    refused += [SourceFile(f, LEFT_OUT, reason=why) for f, why in script.left_out.items()]
+    refused += [SourceFile(f, "", reason=why) for f, why in script.refused.items()]
+    sessions = read_sessions(script.files)
+    own = common_layout(sessions, spec.layout, spec.layout_origin)
+    in_session = [f for f in script.files if sessions and session_of(f, sessions) is not None]
+    rest = sorted(set(script.files) - set(in_session)) if in_session else script.files
+    scan = spec.begin_scan("sessions", [*script.files, *script.originals.values()], own)
+    plain = [f for f in rest if not is_xdf(f)]
+    if spec.columns and len(plain) == len(rest):
+        role = next(iter(spec.columns))
+        raise ConfigError(
+            f"--column {role}=… is for a table or XDF files; '{source}' is a folder: describe it with --pattern FILE."
+        )
+    shape = "labelled-rows" if scan.layout.is_labelled else "gesture-recorder"
+    scan.shape = shape if rest else scan.shape
+    mapping = None if spec.mapping is None else dict(spec.mapping)
+    scan.found = [*refused, *classify_session_files(sessions, in_session)]
+    for file in classify_files(shape, source, plain, mapping, scan.gestures, spec.person):
+        original = script.originals.get(file.source) if file.kind == RECORDINGS else None
+        scan.found.append(file if original is None else replace(file, source=original, cut=file.source))
+    scan.found = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in scan.found]
+    scan.people, of_people = people_of(sessions)
+    scan.notes += [*moved_note(scan.found), *of_people, *script.notes]
+    scan.choices = script.choices
+    _scan_xdf_files(source, list(filter(is_xdf, rest)), spec, scan, around)
+    if mapping is not None:
+        present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
+        if missing := [name for name in mapping if name not in present]:
+            listed = ", ".join(f"'{m}'" for m in missing[:SHOWN]) + (", …" if len(missing) > SHOWN else "")
+            scan.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
+    scan.simulated = simulated or any(not isinstance(head, str) and head.simulated for head in sessions.values())
+    return scan
+
+
+def _scan_xdf_files(source: Path, files: list[Path], spec: ScanSpec, scan: SourceScan, around: Path | None) -> None:
+    """Convert the XDF files of a folder; add their recordings, and a note on sessions with several files."""
+    files_of: dict[tuple[str, str], list[str]] = {}
+    for file in files:
+        name = printable_path(file.relative_to(source))
+        person = None if file.parent == around else file.parent.resolve().name
+        if file.parent == source and spec.person is not None:
+            person = spec.person or None
+        if spec.mapping is not None:
+            person = spec.mapped(file.relative_to(source))
+        with scan.refusing(file, name):
+            files_of.setdefault(convert_xdf(file, name, person, spec, scan), []).append(name)
+    for (subject, session), names in files_of.items():
+        if len(names) > 1:
+            message = f"{len(names)} files are the session '{session}' of '{subject}': {', '.join(names[:SHOWN])}"
+            values = {"n": len(names), "session": session, "person": subject, "files": ", ".join(names[:SHOWN])}
+            scan.notes.append(Sentence(message, reason="session_shared", **values))
+
+
+def _label_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> dict[Path, str]:
+    """Return the folders that are named like a gesture, and its label; ``labels`` are those in the names of files.
+
+    A gesture is one of the set, or a label of any file. The authors' scripts move recordings into such folders, and
+    read the label from there.
+    """
+    known = set(map(plain_label, labels.values()))
+    found: dict[Path, str] = {}
+    for place in {path.parent for path in labels}:
+        name = place.resolve().name
+        gesture = gestures.find(name) if gestures is not None else None
+        if gesture is not None or plain_label(name) in known:
+            found[place] = name if gesture is None else gesture.label
+    return found
+
+
+def _same_gesture(one: str, other: str, gestures: GestureSet | None) -> bool:
+    """Return whether two labels are of one gesture."""
+    if plain_label(one) == plain_label(other) or gestures is None:
+        return plain_label(one) == plain_label(other)
+    found = gestures.find(one)
+    return found is not None and found == gestures.find(other)
+
+
+def _nobodys_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> set[Path]:
+    """Return the folders in which every recording is of a gesture without a person (the toy at rest)."""
+    with_nobody: set[Path] = set()
+    with_people: set[Path] = set()
+    for path, label in labels.items():
+        gesture = gestures.find(label) if gestures is not None else None
+        (with_nobody if gesture is not None and gesture.nobody else with_people).add(path.parent)
+    return with_nobody - with_people
+
+
+def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested: bool) -> None:
+    """Raise DatasetError if two folders have the same name, so that people are neither merged nor split.
+
+    With ``nested``, also raise it for a folder of recordings inside another one.
+    """
+    folders: dict[str, Path] = {}
+    for f in files:
+        if not f.kind or f.subject in (NOBODY, UNKNOWN_SUBJECT):
+            continue
+        other = folders.setdefault(f.subject.casefold(), f.source.parent)
+        if other != f.source.parent:
+            a, b = (p.relative_to(source).as_posix() for p in (other, f.source.parent))
+            raise DatasetError(
+                f"The person is not clear: '{a}' and '{b}' in '{source}' have the same name: {_ASK}.",
+                reason="person_twice",
+                a=a,
+                b=b,
+            )
+    places = set(folders.values())
+    for place in sorted(places) if nested else ():
+        above = next((p for p in place.parents if p in places), None)
+        if above is not None:
+            raise DatasetError(
+                f"The person is not clear: '{place}' lies in '{above}', and both hold recordings: {_ASK}.",
+                reason="person_nested",
+                a=place.name,
+                b=above.name,
+            )
+
+
+def _where(subjects: dict[str, str] | None) -> str:
+    """Return where the person of a file is looked for."""
+    return "in the folder of a person" if subjects is None else "named in the mapping file of --subjects"
+
+
+def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
+    """Return the person that ``subjects`` has for the path of a file below ``source``, or for its name."""
+    return subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
+
+
+def _folder_person(path: Path, source: Path, person: str | None) -> str | None:
+    """Return the person whose folder holds a file; directly in ``source`` it is ``person``, unless that is None."""
+    return path.parent.resolve().name if path.parent != source or person is None else person or None
+
+
+def classify_gesture_recorder(
+    source: Path,
+    files: list[Path],
+    subjects: dict[str, str] | None,
+    gestures: GestureSet | None,
+    person: str | None = None,
+) -> Iterator[SourceFile]:
+    """Classify the files in the folders of the GestureRecorder.
+
+    ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
+    or nobody if all its recordings are of the toy at rest. A folder that is named like a gesture is no person: its
+    people are not known, and its label is that of all its recordings, as a label is corrected by moving the file.
+    ``person`` is as in `import_recordings`.
+    """
+    named = {path: name.label for path in files if (name := parse_name(path.name)) is not None}
+    label_folders = _label_folders(named, gestures)
+    labels = {path: label_folders.get(path.parent, label) for path, label in named.items()}
+    nobodys = _nobodys_folders(labels, gestures)
+    left_behind: set[Path] = set()
+    if label_folders.keys() - nobodys:
+        # Streams that the anonymising step has left behind belong to recordings that no longer name their person, and
+        # the folder of all gestures is no person either.
+        left_behind = {path.parent for path in files} - ({path.parent for path in named} - nobodys) | {source}
+    for path in files:
+        by_label = path.parent in label_folders or path.parent in left_behind
+        if subjects is not None:
+            # A mapping need not list recordings of the untouched toy.
+            subject = _mapped(path, source, subjects) or (NOBODY if path.parent in nobodys else None)
+        elif path.parent in nobodys:
+            subject = NOBODY
+        elif by_label:
+            subject = person or UNKNOWN_SUBJECT
+        else:
+            subject = _folder_person(path, source, person)
+        if path.name.casefold() == STREAM_NAME.casefold():
+            if (by_label and not person) or subject is None:
+                note = Sentence("a session stream whose person is not known", reason="person_unknown")
+                yield SourceFile(path, "", reason=note)
+            else:
+                yield SourceFile(path, STREAMS, subject)
+        elif parse_name(path.name) is None:
+            note = Sentence("not a recording: its name is not <label>_<epoch ms>_<rows>.csv", "file_no_recording")
+            yield SourceFile(path, "", reason=note)
+        elif subject is None:
+            yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
+        else:
+            moved = not _same_gesture(named[path], labels[path], gestures)
+            yield SourceFile(path, RECORDINGS, subject, gesture=labels[path] if moved else "")
+
+
+def classify_labelled_rows(
+    source: Path,
+    files: list[Path],
+    subjects: dict[str, str] | None,
+    gestures: GestureSet | None,
+    person: str | None = None,
+) -> Iterator[SourceFile]:
+    """Classify CSVs with a label on every row: each file is a stream, and runs of equal labels are recordings."""
+    one_person = all(path.parent == source for path in files)
+    for path in files:
+        if subjects is not None:
+            subject = _mapped(path, source, subjects)
+        else:
+            subject = _folder_person(path, source, person) if one_person or path.parent != source else person or None
+        if path.suffix.lower() != ".csv":
+            yield SourceFile(path, "", reason=Sentence("not a CSV file", reason="file_no_recording"))
+        elif subject is None:
+            yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
+        else:
+            yield SourceFile(path, STREAMS, subject)
+
+
+CLASSIFIERS: dict[str, Callable[..., Iterator[SourceFile]]] = {
+    "gesture-recorder": classify_gesture_recorder,
+    "labelled-rows": classify_labelled_rows,
+}
+
+
+def classify_files(
+    shape: str,
+    source: Path,
+    files: list[Path],
+    subjects: dict[str, str] | None,
+    gestures: GestureSet | None,
+    person: str | None = None,
+) -> list[SourceFile]:
+    """Classify regular files by the folder structure ``shape`` (a key of `CLASSIFIERS`); each is returned once.
+
+    Raises:
+        DatasetError: if the folders do not identify the people.
+    """
+    classified = list(CLASSIFIERS[shape](source, files, subjects, gestures, person))
+    if subjects is None:
+        # A person that was named may have recordings in several folders of gestures.
+        _refuse_unclear_people(
+            source, [f for f in classified if f.subject != person], nested=shape == "gesture-recorder"
+        )
+    return classified
+
+
+# Suffixes of files that the recorder leaves behind if it is killed, or is still running.
+_UNFINISHED = Sentence(
+    "not finished when the recorder stopped; its rows are in the session's stream", reason="file_unfinished"
+)
+LEFT_OVER = {
+    ".part": _UNFINISHED,
+    ".new": _UNFINISHED,
+    ".torn": Sentence(
+        "damaged by a crash and renamed by the recorder; its rows are in the session's stream", reason="file_unfinished"
+    ),
+    ".lock": Sentence("a lock of the recorder", reason="file_lock"),
+}
+
+Sessions = dict[Path, SessionHead | str]
+
+
+def read_sessions(files: Iterable[Path]) -> Sessions:
+    """Return for each session folder among ``files`` its head, or the reason why that cannot be used."""
+    sessions: Sessions = {}
+    for path in files:
+        if path.name != SESSION_HEAD:
+            continue
+        try:
+            head = SessionHead.read(path.parent)
+            if head is not None and head.subject.strip():
+                Layout.from_dict(head.layout, "layout")
+        except (BadInput, RecursionError) as cause:
+            message = f"its {SESSION_HEAD} cannot be used: {cause}"
+            sessions[path.parent] = Sentence(message, reason="session_unusable", file=SESSION_HEAD)
+            continue
+        if head is not None:
+            nobody = Sentence(f"its {SESSION_HEAD} names no subject", reason="person_unknown")
+            sessions[path.parent] = head if head.subject.strip() else nobody
+    return sessions
+
+
+def session_of(path: Path, sessions: Mapping[Path, object]) -> Path | None:
+    """Return the nearest session folder that contains a file; None if there is none."""
+    return next((place for place in path.parents if place in sessions), None)
+
+
+def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout | None:
+    """Return the layout that all sessions and ``given`` share; ``of`` describes ``given`` in messages.
+
+    Raises:
+        DatasetError: if two layouts differ, or sessions have a layout with a label on every row.
+    """
+    agreed = given
+    for place, head in sessions.items():
+        if isinstance(head, str):
+            continue
+        own = Layout.from_dict(head.layout, f"layout of the session '{place.name}'")
+        if agreed is None:
+            agreed, of = own, f"session '{place.name}'"
+        elif own.to_dict() != agreed.to_dict():
+            other = f"'{own.name}'" if own.name != agreed.name else f"another '{own.name}'"
+            raise DatasetError(
+                f"Session '{place.name}' was recorded with the layout {other}, but {of} is '{agreed.name}': "
+                "a data set has one layout, so import them apart.",
+                reason="sessions_differ",
+                session=place.name,
+                layout=own.name,
+                other=agreed.name,
+            )
+    if agreed is not None and agreed.is_labelled and any(isinstance(h, SessionHead) for h in sessions.values()):
+        raise DatasetError(
+            f"Layout '{agreed.name}' has a label on every row, unlike sessions: remove 'label' from its csv.columns."
+        )
+    return agreed
+
+
+def classify_session_files(sessions: Sessions, files: Iterable[Path]) -> Iterator[SourceFile]:
+    """Classify those of ``files`` that are in session folders."""
+    by_session: dict[Path, list[Path]] = {}
+    for path in files:
+        place = session_of(path, sessions)
+        if place is not None:
+            by_session.setdefault(place, []).append(path)
+    for place, mine in by_session.items():
+        head = sessions[place]
+        if isinstance(head, str):
+            yield from (SourceFile(path, "", reason=head) for path in mine)
+        else:
+            yield from _find(place, head, mine)
+
+
+def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceFile]:
+    try:
+        discarded = discarded_recordings(place)
+    except (BadInput, OverflowError, RecursionError) as cause:
+        # Without the log it is unknown which recordings were discarded.
+        note = Sentence(f"its {SESSION_LOG} cannot be used: {cause}", reason="session_unusable", file=SESSION_LOG)
+        yield from (SourceFile(path, "", reason=note) for path in files)
+        return
+    stream = place / STREAM_NAME
+    mains = {p.with_suffix("").as_posix(): p for p in files if p == stream or parse_name(p.name) is not None}
+    for path in files:
+        of_session = partial(SourceFile, path, subject=head.subject, session=head.session or place.name)
+        name = path.name
+        if path == stream:
+            yield of_session(STREAMS)
+        elif parse_name(name) is not None:
+            yield of_session(RECORDINGS, set_aside=discarded.get(name, ""))
+        elif path.parent == place and name in (SESSION_HEAD, SESSION_LOG):
+            yield of_session(COMPANIONS, beside=stream if stream in files else None)
+        elif path.suffix in LEFT_OVER:
+            yield of_session(LEFT_OUT, reason=LEFT_OVER[path.suffix])
+        elif name.endswith(SIDECAR):
+            main = mains.get(path.with_suffix("").as_posix())
+            if main is None:
+                note = Sentence("the sidecar of a recording that is missing", reason="file_orphan")
+                yield of_session(LEFT_OUT, reason=note)
+            else:
+                yield of_session(COMPANIONS, beside=main)
+        else:
+            note = Sentence(
+                "no file of a session: expected are recordings, sidecars, stream and log", reason="file_no_recording"
+            )
+            yield of_session("", reason=note)
+
+
+def moved_note(files: Iterable[SourceFile]) -> list[Sentence]:
+    """Return a note on recordings that get the label of their folder, and not that of their name."""
+    moved = [f for f in files if f.gesture]
+    if not moved:
+        return []
+    first = f"'{(moved[0].cut or moved[0].source).name}' in '{moved[0].gesture}'"
+    message = (
+        f"{plural(len(moved), 'recording')} in the folder of another gesture than the name says (the first: {first}): "
+        "the folder's label is taken by a mark, as the authors' scripts read the label from the folder"
+    )
+    return [Sentence(message, "moved_by_label", n=len(moved), file=first)]
+
+
+def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
+    """Return the people of the sessions, with the latest value of each field, and a note for each changed value."""
+    people: dict[str, PersonInfo] = {}
+    notes: list[str] = []
+    heads = sorted((h for h in sessions.values() if isinstance(h, SessionHead)), key=lambda h: h.started_ms)
+    for head in heads:
+        values = {key: _plain(getattr(head, key)) for key in ("age_group", "gender", "consent")}
+        before = people.get(head.subject)
+        for key, value in values.items() if before is not None else ():
+            earlier = getattr(before, key)
+            if earlier and value and earlier != value:
+                message = (
+                    f"the sessions of '{head.subject}' differ in {key.replace('_', ' ')} ('{earlier}', '{value}'): "
+                    "the latest is kept"
+                )
+                values_of = {"person": head.subject, "old": earlier, "new": value}
+                notes.append(Sentence(message, reason="person_changed", **values_of))
+            values[key] = value or earlier
+        people[head.subject] = PersonInfo(head.subject, values["age_group"], values["gender"], values["consent"])
+    return list(people.values()), notes
+
+
+def _plain(text: str) -> str:
+    """Return ``text`` as one printable line."""
+    text = text.encode("utf-8", "replace").decode("utf-8")
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -1,1 +1,0 @@
-"""Train and compare the networks of a grid: the grid itself, the plan of trainings, their scores and tables."""
