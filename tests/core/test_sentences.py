@@ -53,6 +53,8 @@ _FILLED = {
 }  # fmt: skip
 # Joins of which the function itself ensures that there is something to join.
 _NEVER_EMPTY = {
+    "', '.join(map(str, grid.exceeded(near)))": "networks that exceed a limit",
+    "', '.join(map(str, grid.exceeded(a)))": "networks that exceed a limit",
     "', '.join((f'{name} {macs:,}' for name, macs in profile.macs_by_layer.items()))": "a network has layers",
     "', '.join((a for a in vector if a in named))": "after 0 < len(set(vector) & set(named))",
     "', '.join((f'{name} {value:g}' for name, value in self.zero.items()))": "three axes",
