@@ -134,12 +134,6 @@ def test_every_network_whose_predictions_a_sweep_kept_leads_to_its_recordings(
         i, j = (int(n) for n in np.argwhere(counts * (1 - np.eye(len(counts), dtype=int)))[0])
         labels = details.by_gesture.labels
         assert sum(r.windows for r in results.misread(row, [labels[i]], [labels[j]])) == counts[i, j]
-    # Folders of earlier versions name the trial of the only file.
-    summary = json.loads((out / "sweep.json").read_text(encoding="utf-8"))
-    best = summary["best"][0]["trial"]
-    del summary["predictions"]
-    (out / "sweep.json").write_text(json.dumps(summary | {"predicted": best}), encoding="utf-8")
-    assert {row.trial: results.details(row).clickable for row in rows} == {row.trial: row.trial == best for row in rows}
 
 
 def test_a_verdict_names_its_limits(home: Path) -> None:
