@@ -181,7 +181,7 @@ def test_live_warns_and_sums_up(tmp_path: Path) -> None:
         decisions = list(live)
     assert len(decisions) > 100, "nothing is refused"
     assert len(warned) == 1 and "it seems to send g" in warned[0]
-    assert live.summary().messages == tuple(warned)
+    assert live.summary().warnings == tuple(warned)
     with (
         open_device(f"replay://{path.as_posix()}?speed=0", bundle.layout) as device,
         pytest.warns(UserWarning, match="At rest the accelerometer"),
