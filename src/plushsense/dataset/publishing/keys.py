@@ -66,12 +66,17 @@ class PublicationKey:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_file(path, out.getvalue(), private=True)
         except OSError as cause:
-            raise DatasetError(
-                f"The key '{path}' cannot be written ({cause.strerror or cause}): choose another place for it.",
-                reason="key_not_written",
-                file=path.name,
-                why=cause.strerror or str(cause),
-            ) from None
+            raise _unusable(path, cause) from None
+
+
+def _unusable(path: Path, cause: OSError) -> DatasetError:
+    why = cause.strerror or str(cause)
+    return DatasetError(
+        f"The key '{path}' cannot be read or written ({why}): choose another place for it.",
+        reason="key_not_written",
+        file=path.name,
+        why=why,
+    )
 
 
 def is_drawn(code: str) -> bool:
@@ -101,12 +106,7 @@ def open_key(path: Path, *apart_from: Path) -> PublicationKey:
             file=path.name,
         ) from None
     except OSError as cause:
-        raise DatasetError(
-            f"The key '{path}' cannot be used: {cause.strerror or cause}.",
-            reason="key_not_written",
-            file=path.name,
-            why=cause.strerror or str(cause),
-        ) from None
+        raise _unusable(path, cause) from None
     key = PublicationKey()
     key.write(path)
     return key
