@@ -26,7 +26,8 @@ def text_of(value: T) -> T:
 # What the type checker cannot know: the surrounding condition, or its caller's, excludes None.
 KNOWN = {
     "parser.description", "sentence.get('reason')", "code", "self.adapted_to", "b.adapted_to", "target.address",
-    "limit", "merges", "done.bundle.adapted_to", "subject", "total", "c.call_bound", "arch",
+    "limit", "merges", "done.bundle.adapted_to", "subject", "total", "c.call_bound", "arch", "bundle.adapted_to",
+    "spec.key", "self.scores.mean('accuracy')", "best.mean('accuracy')",
 }  # fmt: skip
 
 

@@ -16,6 +16,7 @@ import pytest
 from plushsense.core.errors import LayoutError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Channel, Layout, load_layout
+from plushsense.deploy.code import facts_of
 from plushsense.deploy.emit import emit
 from plushsense.deploy.golden import answers_of, column, read_golden
 from plushsense.deploy.package import (
@@ -315,7 +316,9 @@ def test_names_of_any_kind_become_legal(tmp_path: Path) -> None:
 
 
 def test_channels_that_no_pad_measures_are_marked() -> None:
-    plain = load_layout("accel-3")
+    bundle = bundle_of()
+    plain, model = bundle.layout, integer_model(bundle)
+    facts = facts_of(model, bundle, model.to_bytes())
     for kinds, note in (
         ([("capacitive", "count")] * 12, "NO PAD IS LEFT"),
         ([("heat", "K"), ("acceleration", "count")], "see read_other()"),
@@ -325,7 +328,6 @@ def test_channels_that_no_pad_measures_are_marked() -> None:
         wire = ("device_ms", *names)
         csv = replace(plain.csv, columns=wire, header=wire)
         layout = replace(plain, channels=channels, wire=wire, inputs=names, vectors=(), csv=csv)
-        facts = {"title": "t", "classes": 2, "span": 10}
         files = firmware(layout, Scaler(np.zeros(len(names)), np.ones(len(names))), facts)
         assert set(files) == set(FIRMWARE)
         assert note in files["PlushToy.ino"] and note in files["main.c"]

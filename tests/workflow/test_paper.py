@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,7 +16,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import parse_name, read_recording
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.baselines.models import BASELINES
-from plushsense.experiments.baselines.run import baselines
+from plushsense.experiments.baselines.run import BaselinesResult, ComparisonSpec, baselines
 
 TESTS = Path(__file__).resolve().parents[1]
 
@@ -130,9 +131,9 @@ def test_the_papers_result_with_pca_stands_beside_pca_without_scaling(
 ) -> None:
     asked: list[tuple[Any, ...]] = []
 
-    def small(dataset: Dataset, *, models: Any, **settings: Any) -> dict[str, Any]:
-        asked.append((*models, settings["features"], settings["pca"], settings["splits"]))
-        return baselines(dataset, **{**settings, "splits": ("windows:2",)}, models="forest", workers=1)
+    def small(dataset: Dataset, *, spec: ComparisonSpec, **settings: Any) -> BaselinesResult:
+        asked.append((*spec.models, spec.features, spec.pca, spec.splits))
+        return baselines(dataset, spec=replace(spec, splits=("windows:2",), models="forest"), workers=1, **settings)
 
     monkeypatch.setattr(script, "baselines", small)
     monkeypatch.setitem(BASELINES, "forest", BASELINES["tree"])

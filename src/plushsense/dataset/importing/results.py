@@ -109,7 +109,10 @@ class ImportResult:
 
 @dataclass(frozen=True)
 class PreviewRow:
-    """One sample of a previewed recording; ``values`` are in the units of the file, None where a value is invalid."""
+    """A row of the table that a dry run prints: one sample of a recording, before it is imported.
+
+    ``values`` are in the units of the file by channel, None where a value is invalid.
+    """
 
     file: str
     subject: str

@@ -66,11 +66,15 @@ class PublicationKey:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_file(path, out.getvalue(), private=True)
         except OSError as cause:
-            raise DatasetError(
-                "The key '{file}' cannot be written ({why}): choose another place for it.",
-                file=path,
-                why=cause.strerror or cause,
-            ) from None
+            raise _unusable(path, cause) from None
+
+
+def _unusable(path: Path, cause: OSError) -> DatasetError:
+    return DatasetError(
+        "The key '{file}' cannot be read or written ({why}): choose another place for it.",
+        file=path,
+        why=cause.strerror or cause,
+    )
 
 
 def is_drawn(code: str) -> bool:
@@ -100,7 +104,7 @@ def open_key(path: Path, *apart_from: Path) -> PublicationKey:
             cause=cause,
         ) from None
     except OSError as cause:
-        raise DatasetError("The key '{file}' cannot be used: {why}.", file=path, why=cause.strerror or cause) from None
+        raise _unusable(path, cause) from None
     key = PublicationKey()
     key.write(path)
     return key

@@ -25,7 +25,7 @@ _AS_SAVED = ("id", "title", "seeds", "simulated", "split", "leaky", "context", "
 
 @dataclass(frozen=True)
 class SavedEvaluation:
-    """What `evaluate` wrote to a folder, as far as a comparison reads it.
+    """An evaluation read from its folder: settings, predictions, and scores by person.
 
     ``data`` is the hash of the data set, ``people`` the metrics of each person over windows, ``train_windows`` the mean
     number of training windows of a fold.
@@ -77,7 +77,10 @@ class SavedEvaluation:
 
 @dataclass(frozen=True)
 class ComparedModel:
-    """One evaluation of a comparison; ``scores`` and ``rank`` have a summary and a mean rank over people by metric."""
+    """An evaluation in a comparison, with its place among the others.
+
+    ``scores`` has a summary over people, ``rank`` the mean rank over people, both by metric.
+    """
 
     name: str
     evaluation: SavedEvaluation
@@ -133,12 +136,12 @@ class PairedComparisonResult:
 
     @property
     def leaky(self) -> bool:
-        """Whether a split is leaky."""
+        """Whether any of the evaluations has a leaky split (`plushsense.scoring.splits`)."""
         return any(model.evaluation.leaky for model in self.models)
 
     @property
     def simulated(self) -> bool:
-        """Whether the people are virtual."""
+        """Whether any of the evaluations is of virtual people, so that its scores say nothing about a real toy."""
         return any(model.evaluation.simulated for model in self.models)
 
     @property

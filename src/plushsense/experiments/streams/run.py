@@ -185,7 +185,10 @@ def recipes_for(
         recipes[WINDOWS] = Recipe(arch, training, run.scored_on, gestures)
     if ANYWHERE in networks:
         gestures = classes_for(dataset, classes, "anywhere", warn if WINDOWS not in networks else silent)
-        pool = run.network.pool if anywhere_pool_s is None else dataset.layout.samples(anywhere_pool_s)
+        pool = run.network.pool
+        if anywhere_pool_s is not None:
+            replace(run.model, pool_s=anywhere_pool_s)  # refuses what is no pool
+            pool = dataset.layout.samples(anywhere_pool_s)
         arch = replace(run.network, classes=len(gestures), pool=pool)
         halved = replace(training, epochs=-(-training.epochs // 2))
         if training.halve_every:

@@ -42,7 +42,10 @@ class GridProblems(ConfigError):
 
 @dataclass(frozen=True)
 class TrialRun:
-    """One trial with one seed on one fold, and the job that trains it; ``batch`` in windows."""
+    """One of the trainings of a trial: that with ``seed`` on ``fold``, which the job with the id ``job`` does.
+
+    ``span`` is the number of samples of its windows, ``batch`` the size of a batch in windows.
+    """
 
     job: str
     seed: int
@@ -54,7 +57,10 @@ class TrialRun:
 
 @dataclass(frozen=True)
 class Trial:
-    """One network, trained for ``epochs`` in batches of ``batch`` windows ("full": all windows in one batch)."""
+    """One row of a sweep: a network and its schedule, trained with each seed on each fold (``runs``).
+
+    It is trained for ``epochs`` in batches of ``batch`` windows ("full": all windows in one batch).
+    """
 
     id: str
     arch: Arch

@@ -28,7 +28,9 @@ CURVE = ("train_loss", "train_accuracy", "validation_loss", "validation_accuracy
 
 @dataclass(frozen=True)
 class Task:
-    """One training on one fold, scored after each of ``epochs``; ``span`` selects the windows, ``id`` is the job's.
+    """A job of a sweep: train a network on one fold, and score it after each of ``epochs``.
+
+    ``span`` selects the windows, ``id`` is the job's.
 
     The training continues from ``start`` (a `FitState`), if given, which took ``spent_s`` seconds; the weights do not
     depend on it. If ``stateful``, the result includes the final state, from which another training can continue.
@@ -46,7 +48,7 @@ class Task:
 
     @property
     def nested(self) -> bool:
-        """Whether the weights after an epoch equal the final weights of a training of that many epochs."""
+        """Whether one training gives the scores of all its numbers of ``epochs``: not if it may stop early."""
         return self.spec.patience is None
 
 

@@ -116,7 +116,7 @@ class TrialResult:
 
     @property
     def ranked(self) -> bool:
-        """Whether the trial can be compared with others: every run is finished and has an accuracy."""
+        """Whether the trial takes part in rankings: every one of its trainings is finished and has an accuracy."""
         return self.status == "done" and self.mean("accuracy") is not None
 
     @property
