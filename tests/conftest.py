@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import fnmatch
 import importlib.util
 import os
 import shutil
@@ -17,7 +18,6 @@ import pytest
 from hypothesis import settings
 
 from support import apart
-from support.exhaustive import EXHAUSTIVE
 from support.memory import LIMIT_MB, memory_mb
 from support.requirements import missing
 
@@ -35,39 +35,8 @@ settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True
 settings.load_profile("ci" if os.environ.get("PLUSHSENSE_REQUIRE") else "desk")
 
 
-# Folders, files and fixtures of tests that take seconds; `make test-quick` leaves them out.
+# Folders and fixtures of tests that take seconds; `make test-quick` leaves them out, and files marked `slow`.
 SLOW_FOLDERS = {"bench", "cli", "deploy", "experiments", "faults", "studio", "workflow"}
-SLOW_FILES = {
-    "dataset/importing/test_importers_fuzz.py",
-    "devices/test_wire_fuzz.py",
-    "jobs/test_cluster.py",
-    "jobs/test_pool.py",
-    "recording/test_engine.py",
-    "reports/test_quality.py",
-    "reports/test_trims.py",
-    "runtime/test_faults.py",
-    "tuning/test_decisions.py",
-    "tuning/test_gate.py",
-    "tuning/test_rule_baseline.py",
-}
-# Files that take longest, the longest first. The workers begin with them: one of them begun late would end alone.
-LONGEST = (
-    "studio/test_therapist.py",
-    "studio/test_review.py",
-    "studio/test_record.py",
-    "studio/test_shell.py",
-    "studio/test_live_page.py",
-    "studio/test_train_scores.py",
-    "studio/test_pictures_of_pages.py",
-    "studio/test_record_refusals.py",
-    "deploy/proof/test_verify.py",
-    "studio/test_home.py",
-    "test_pages.py",
-    "studio/test_train.py",
-    "cli/test_paper_page.py",
-    "studio/test_live_long.py",
-    "studio/test_record_whole.py",
-)
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
 
 
@@ -86,7 +55,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def _in_slow_place(path: Path) -> bool:
     place = path.relative_to(REPO / "tests").as_posix() if path.is_relative_to(REPO / "tests") else ""
-    return place.split("/")[0] in SLOW_FOLDERS or place in SLOW_FILES
+    return place.split("/")[0] in SLOW_FOLDERS
 
 
 def _place(item: pytest.Item) -> str:
@@ -98,8 +67,8 @@ def _place(item: pytest.Item) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> Iterator[None]:
     """Mark the tests that `make test-quick` and `make test` leave out, and deal those that are left to the workers."""
     for item in items:
-        named = f"{_place(item)}::{item.name}"
-        if {named, named.partition("[")[0]} & EXHAUSTIVE:
+        case = item.callspec.id if isinstance(item, pytest.Function) and hasattr(item, "callspec") else ""
+        if any(fnmatch.fnmatchcase(case, one) for mark in item.iter_markers("exhaustive_for") for one in mark.args):
             item.add_marker(pytest.mark.exhaustive)
         if _in_slow_place(item.path) or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
@@ -116,10 +85,12 @@ def _dealt(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
     for item in items:
         files.setdefault(_place(item), []).append(item)
     parts: list[list[pytest.Item]] = [[] for _ in range(workers)]
-    for at, name in enumerate(name for name in LONGEST if name in files):
+    # The workers begin with the files that take longest: one of them begun late would end alone.
+    for at, name in enumerate([name for name, own in files.items() if own[0].get_closest_marker("early")]):
         parts[at % workers] += files.pop(name)
     # What runs in one process beside a worker is asked for by one worker, if it can be.
-    together = [name for group in apart.GROUPS for name in group if name in files]
+    groups = {name: apart.group_of(own[0]) for name, own in files.items()}
+    together = sorted(filter(groups.get, groups), key=groups.__getitem__)
     rest = [item for name in dict.fromkeys([*together, *files]) for item in files[name]]
     for at, part in enumerate(parts):
         size = (len(items) - sum(map(len, parts[:at]))) // (workers - at)

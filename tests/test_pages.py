@@ -35,6 +35,8 @@ from plushsense.studio.app import serve
 from plushsense.workflow.api import import_simulation
 from support.kept_objects import keeping_answers, keeping_objects
 
+pytestmark = [pytest.mark.apart("pages"), pytest.mark.early]
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = {
@@ -368,6 +370,24 @@ def few_settings(monkeypatch: pytest.MonkeyPatch, c_compiler: str) -> None:
 
 @pytest.mark.usefixtures("few_settings")
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in WHOLE and once(page)])
+@pytest.mark.exhaustive_for(
+    "docs/baselines.md",
+    "docs/checks.md",
+    "docs/commands.md",
+    "docs/firmware.md",
+    "docs/importing.md",
+    "docs/live.md",
+    "docs/measurements/results.md",
+    "docs/pairing.md",
+    "docs/people.md",
+    "docs/personal.md",
+    "docs/questions.md",
+    "docs/record.md",
+    "docs/streams.md",
+    "docs/sweep.md",
+    "docs/trim.md",
+    "docs/virtual-toy.md",
+)
 def test_every_command_of_the_page_runs(
     page: str, prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,10 +9,13 @@ import pytest
 
 from plushsense.workflow.api import simulate
 
+pytestmark = pytest.mark.apart("pages")
+
 PAGE = Path(__file__).parents[1] / "docs" / "questions.md"
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_every_program_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

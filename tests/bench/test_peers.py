@@ -55,6 +55,7 @@ def main(monkeypatch: pytest.MonkeyPatch, *more: str) -> int:
     return peers.main()
 
 
+@pytest.mark.exhaustive
 def test_without_any_peer_ours_and_plain_loops_are_measured_with_both_algorithms(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -80,6 +81,7 @@ def test_without_any_peer_ours_and_plain_loops_are_measured_with_both_algorithms
     assert 1000 < mine["instructions"] < whole["instructions"]
 
 
+@pytest.mark.exhaustive
 def test_a_peer_that_is_not_installed_is_named_with_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -130,6 +132,7 @@ def small() -> Case:
     return make_case("5_4d2", "4,6", layout="accel-3", window=40, form="window")
 
 
+@pytest.mark.exhaustive
 def test_plain_loops_give_the_floats_answer_of_each_algorithm(small: Case, tmp_path: Path) -> None:
     small.save(tmp_path)
     shop = Workshop(tmp_path)

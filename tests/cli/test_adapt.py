@@ -16,6 +16,8 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.experiments.adaptation import adapt
 from plushsense.models.bundle import Bundle
 
+pytestmark = pytest.mark.apart("trainings")
+
 Cli = Callable[..., Any]
 Make = Callable[[Path, int], None]
 SWAPPED = {"Slow": "Fast", "Fast": "Slow"}
@@ -177,6 +179,7 @@ def test_forget_names_the_recordings_that_the_studio_discarded(cli: Cli, strange
     assert f"discarded recordings of this code, delete them: {discarded[0]}" in ran.out
 
 
+@pytest.mark.exhaustive
 def test_people_left_out(cli: Cli, make_session: Make, tmp_path: Path) -> None:
     source = tmp_path / "R"
     for n, labels in enumerate((None, None, SWAPPED)):

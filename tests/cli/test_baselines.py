@@ -16,7 +16,7 @@ from plushsense.experiments.baselines.run import MODELS, SETS, chosen
 
 Cli = Callable[..., Any]
 
-pytestmark = pytest.mark.usefixtures("scikit_learn")
+pytestmark = [pytest.mark.usefixtures("scikit_learn"), pytest.mark.apart("scikit-learn")]
 
 SPLITS = "by-subject:2,windows:3"
 QUICK = ("--models", "knn,tree", "--features", "statistics", "--workers", 1)
@@ -116,6 +116,7 @@ def test_pca_without_scaling_has_rows_of_its_own(cli: Cli, dataset: Dataset, tmp
     assert "statistics, PCA unscaled" in ran.out and "2 of 2 fits (2 from before)" in ran.err
 
 
+@pytest.mark.exhaustive
 def test_on_real_recordings_a_leaky_split_flatters_trees(cli: Cli, real_data: Path, tmp_path: Path) -> None:
     dataset = import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3").dataset
     found = cli(

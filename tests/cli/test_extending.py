@@ -14,6 +14,8 @@ from plushsense.core import toml
 from plushsense.dataset.store import Dataset
 from support.small_dataset import Cli
 
+pytestmark = pytest.mark.apart("trainings")
+
 LAYOUT = """
 name = "tilt-2"
 rate_hz = 50.0

@@ -10,11 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from plushsense.dataset.store import Dataset
 
 COMMAND = [sys.executable, "-m", "plushsense"]
 
 
+@pytest.mark.exhaustive
 def test_kill_9_in_the_middle(dataset: Dataset, cli: Callable[..., Any]) -> None:
     words = ["evaluate", str(dataset.path), "--filters", "4,4,4", "--epochs", "10", "--json", "--workers"]
     process = subprocess.Popen([*COMMAND, *words, "2"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -17,6 +17,8 @@ import pytest
 
 from support.traced import SocketTrace
 
+pytestmark = pytest.mark.apart("trainings")
+
 COMMAND = [sys.executable, "-m", "plushsense"]
 KEYS = ["t_s", "gesture", "affect", "confidence", "source", "state", "answer", "events"]
 

@@ -22,6 +22,8 @@ from plushsense.dataset.store import Dataset
 from plushsense.models.bundle import Bundle
 from support.bundles import odd_bundle
 
+pytestmark = pytest.mark.apart("trainings")
+
 Cli = Callable[..., Any]
 
 LEAKY = '<span class="leaky">LEAKY</span>'
@@ -308,6 +310,7 @@ def evaluations(dataset: Dataset) -> set[str]:
     return {p.parent.name for p in (dataset.path / "evaluations").glob("*/evaluation.json")}
 
 
+@pytest.mark.exhaustive
 def test_evaluations_of_other_settings_stand_side_by_side(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
     words = ("evaluate", dataset.path, "--filters", "2,2,2", "--epochs", "1", "--split", "by-subject:2", "--workers")
     assert cli(*words, "1").status == 0

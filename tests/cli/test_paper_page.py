@@ -22,6 +22,8 @@ from plushsense.experiments.protocol.sittings import virtual_sittings
 from plushsense.studio.app import serve
 from support.archive import make_archive
 
+pytestmark = [pytest.mark.apart("trainings"), pytest.mark.early]
+
 ROOT = Path(__file__).parents[2]
 PAGE, TUTORIAL = ROOT / "docs" / "paper.md", ROOT / "docs" / "own-sensor.md"
 VERDICTS = ("better", "equal", "not possible here", "weaker")
@@ -89,6 +91,7 @@ def run(command: str) -> tuple[int, str]:
 
 
 @pytest.mark.usefixtures("c_compiler")
+@pytest.mark.exhaustive
 def test_the_tutorial_ends_with_the_same_answers_in_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("plushsense.deploy.proof.verify.settings_of", lambda name: [Setting(name, "gcc", "-O2")])
@@ -107,6 +110,7 @@ def test_the_tutorial_ends_with_the_same_answers_in_c(tmp_path: Path, monkeypatc
 
 
 @pytest.mark.usefixtures("publish_tools", "c_compiler")
+@pytest.mark.exhaustive
 def test_every_command_runs(tmp_path: Path) -> None:
     """In a process of its own: PyTorch, scikit-learn, the figures and the validators together take 640 MB."""
     paths = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]

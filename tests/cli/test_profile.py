@@ -70,6 +70,7 @@ def test_json_and_text(export: Path, capsys: pytest.CaptureFixture[str], target_
         assert part in " ".join(text.split())
 
 
+@pytest.mark.exhaustive
 def test_how_it_is_compiled_matters(
     export: Path, capsys: pytest.CaptureFixture[str], target_here: Callable[[str], str]
 ) -> None:

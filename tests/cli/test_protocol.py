@@ -20,6 +20,8 @@ from plushsense.recording.simulate import simulate
 from plushsense.windows.features import Scaler
 from support.real_times import copied_as_if_real
 
+pytestmark = pytest.mark.apart("trainings")
+
 
 def bundle(**provenance):
     layout = load_layout("plush-15")

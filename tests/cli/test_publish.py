@@ -19,7 +19,7 @@ Cli = Callable[..., Any]
 CONTACT = ("--contact", "Ada <ada@example.org>")
 SAID = (*CONTACT, "--licence", "CC-BY-4.0", "--consent", "all agreed")
 
-pytestmark = pytest.mark.usefixtures("publish_tools")
+pytestmark = [pytest.mark.usefixtures("publish_tools"), pytest.mark.apart("publishing")]
 
 
 @pytest.fixture(autouse=True)
@@ -57,6 +57,7 @@ def test_from_refusal_to_a_valid_package(cli: Cli, dataset: Dataset, tmp_path: P
     assert cli("publish", dataset.path, out, *SAID).status == 2
 
 
+@pytest.mark.exhaustive
 def test_the_report_says_the_codes_of_the_package(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
     for number, code in enumerate(dataset.subjects, 1):
         for kind in ("recordings", "streams"):
@@ -69,6 +70,7 @@ def test_the_report_says_the_codes_of_the_package(cli: Cli, dataset: Dataset, tm
     assert set(figures["trials"][0]["by_person"]) == published == {"P1", "P2", "P3", "P4", "P5"}
 
 
+@pytest.mark.exhaustive
 def test_saving_and_leaving_the_report_out(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
     key = tmp_path / "key.txt"
     ran = cli("publish", dataset.path, tmp_path / "a", *SAID, "--save", "--no-reidentification", "--key", key)

@@ -17,6 +17,8 @@ from plushsense.experiments.streams.run import streams_at
 from plushsense.experiments.streams.systems import SYSTEMS
 from plushsense.models.bundle import Bundle, trained_people
 
+pytestmark = pytest.mark.apart("trainings")
+
 Cli = Callable[..., Any]
 
 KEYS = ("events", "hits", "deletions", "insertions", "fragmentations", "merges", "false_events_per_hour", "latency_s")

@@ -19,6 +19,8 @@ from plushsense.dataset.store import PersonInfo, write_people
 from plushsense.dataset.trimming import decide_trims
 from plushsense.windows.cut import WindowSpec, cut_windows
 
+pytestmark = pytest.mark.apart("trainings")
+
 Cli = Callable[..., Any]
 ACCEL = load_layout("accel-3")
 

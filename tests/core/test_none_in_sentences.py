@@ -67,6 +67,7 @@ def shown(folder: Path) -> dict[str, set[str]]:
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_sentence_shows_none(tmp_path: Path) -> None:
     pytest.importorskip("mypy")
     copied(PACKAGE, tmp_path)

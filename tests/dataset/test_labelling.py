@@ -24,6 +24,8 @@ from plushsense.dataset.marks import MARKS, LabelledStretch, Mark, append_marks,
 from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.store import Dataset
 
+pytestmark = pytest.mark.apart("real-recordings")
+
 ACCEL = load_layout("accel-3")
 P1, P2 = "P1/fulldatastream", "P2/fulldatastream"
 

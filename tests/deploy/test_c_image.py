@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -346,6 +347,7 @@ def run(program: Path, file: Path, *swaps: str) -> bytes:
     return done.stdout
 
 
+@pytest.mark.exhaustive
 def test_sanitizers_find_nothing_in_good_models(sanitized: list[Path], tmp_path: Path) -> None:
     """Extremes on purpose: full ranges, garbage, gaps, saturated scales."""
     found = []

@@ -41,6 +41,7 @@ def assert_a_step_is_placed(file: Path) -> None:
 
 @pytest.mark.parametrize("cc", ["gcc", "clang"])
 @pytest.mark.parametrize("plain", [[], ["-DPLUSH_PLAIN"], ["-DPLUSH_CALIBRATE"]], ids=["fast", "plain", "calibrate"])
+@pytest.mark.exhaustive_for("calibrate-clang", "plain-clang", "plain-gcc")
 def test_no_warning_and_three_functions_of_the_c_library(
     cc: str, plain: list[str], needs: Callable[..., None], tmp_path: Path
 ) -> None:
@@ -64,6 +65,7 @@ def test_no_warning_and_three_functions_of_the_c_library(
     ],
     ids=["cortex-m4", "cortex-m0", "lx106"],
 )
+@pytest.mark.exhaustive_for("cortex-m4", "lx106")
 def test_small_cores_need_no_long_division(
     cc: str, flags: list[str], also: set[str], needs: Callable[..., None], tmp_path: Path
 ) -> None:
@@ -93,6 +95,7 @@ def test_small_cores_need_no_long_division(
     subprocess.run([*common, "-c", "size.c"], check=True, cwd=tmp_path)
 
 
+@pytest.mark.exhaustive
 def test_cppcheck(needs: Callable[..., None]) -> None:
     needs("cppcheck")
     for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN", "-DPLUSH_CALIBRATE"):
@@ -117,6 +120,7 @@ def test_cppcheck(needs: Callable[..., None]) -> None:
         assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.exhaustive
 def test_clang_tidy(needs: Callable[..., None]) -> None:
     needs("clang-tidy")
     checks = [

@@ -115,6 +115,7 @@ def test_a_damaged_model_blinks_and_the_lines_go_on(packages: Packages, tmp_path
     assert len({pin for _, pin, value in pins if value}) == 1
 
 
+@pytest.mark.exhaustive
 def test_clang_agrees(packages: Packages, tmp_path: Path) -> None:
     for layout in LAYOUTS:
         for sensors in (0, 1, 2):

@@ -78,6 +78,7 @@ def named(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize(("compiler", "suffix"), [(("gcc", "-std=c99"), "c"), (("g++", "-std=c++11"), "cpp")])
+@pytest.mark.exhaustive_for("compiler1-cpp")
 def test_several_models_in_one_program_answer_as_alone(
     named: dict[str, Path], needs: Callable[..., None], tmp_path: Path, compiler: tuple[str, ...], suffix: str
 ) -> None:

@@ -20,6 +20,7 @@ Here = Callable[[str], str]
 
 
 @pytest.mark.parametrize("target", COUNTING)
+@pytest.mark.exhaustive_for("cortex-m0", "cortex-m33", "cortex-m4", "riscv32")
 def test_counts(target: str, small: Path, target_here: Here) -> None:
     facts = read_facts(small)
     before = {p: p.read_bytes() for p in small.rglob("*") if p.is_file()}
@@ -50,6 +51,7 @@ def test_counts(target: str, small: Path, target_here: Here) -> None:
     assert "memset" in cost.needs and not cost.heap and not cost.floats and not cost.masking
 
 
+@pytest.mark.exhaustive
 def test_a_larger_network_costs_more_only_where_it_is_larger(small: Path, tmp_path: Path, target_here: Here) -> None:
     target = target_here("riscv32")
     large = exported(tmp_path / "large", bundle_of("plush-15", filters="4,12"))
@@ -67,6 +69,7 @@ def test_a_larger_network_costs_more_only_where_it_is_larger(small: Path, tmp_pa
         ("v14_17d2_19d4", {"xtensa": (185_000, 26), "cortex-m4": (85_000, 24)}),
     ],
 )
+@pytest.mark.exhaustive_for("14d1_19d2_19d4-limits1", "14d1_39d2_41d4-limits0")
 def test_the_networks_of_the_issue_stay_within_their_limits(
     symbol: str, limits: dict[str, tuple[int, int]], tmp_path: Path, target_here: Here
 ) -> None:
@@ -101,6 +104,7 @@ def test_a_heap_and_floating_point_are_found(own: Path, target_here: Here) -> No
     assert cost.masking == ("rsil",)
 
 
+@pytest.mark.exhaustive
 def test_what_is_counted_is_what_stands_in_the_folder(own: Path, small: Path, target_here: Here) -> None:
     target = target_here("riscv32")
     source = own / "plushsense.c"

@@ -18,6 +18,8 @@ from plushsense.devices.virtual.session import GESTURES, VirtualSession
 from plushsense.devices.virtual.stream import ToySpec, ToyStream, VirtualDevice
 from plushsense.devices.virtual.world import CHANNELS, WORLD, ZONES, draw_person
 
+pytestmark = pytest.mark.apart("real-recordings")
+
 PLUSH = load_layout("plush-15")
 
 

@@ -13,6 +13,8 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.devices.wire import LineParser, ParsedLine
 from support.sent_lines import format_line
 
+pytestmark = pytest.mark.slow
+
 LAYOUTS = {name: load_layout(name) for name in ("plush-15", "plush-14", "accel-3", "phone-6")}
 BOM = b"\xef\xbb\xbf"
 WORDS = [

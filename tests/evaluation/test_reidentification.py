@@ -17,7 +17,7 @@ from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.reidentification import SEES, features, reidentify, report, verdict
 
-pytestmark = pytest.mark.usefixtures("publish_tools")
+pytestmark = [pytest.mark.usefixtures("publish_tools"), pytest.mark.apart("reidentification")]
 
 ACCEL = load_layout("accel-3")
 

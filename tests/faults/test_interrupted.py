@@ -25,7 +25,10 @@ from plushsense.recording.session import is_finished
 from plushsense.recording.session_files import read_events
 from support.drills import REPETITIONS, Drill, Fault, Ran, appending, contents, names, run, server, start
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a process cannot be forked there")
+pytestmark = [
+    pytest.mark.skipif(sys.platform == "win32", reason="a process cannot be forked there"),
+    pytest.mark.apart("trainings"),
+]
 PROTOCOL = 'name = "short"\ngesture_set = "plush-18"\ngestures = ["Tail tap 1", "Hold strong"]\nrepetitions = 2\n'
 SHORT = "--epochs 1 --workers 1 --context loop --json"
 
@@ -149,6 +152,7 @@ SLOWEST = ("evaluate", "sweep", "publish")
 @pytest.mark.parametrize(
     ("name", "fault"), [(n, f) for n in DRILLS for f in ("kill", "full") if LONG or f == "kill" or n not in SLOWEST]
 )
+@pytest.mark.exhaustive_for("adapt-full-0", "backup-full-0", "check-full-0", "export-full-0", "forget-full-0")
 def test_given_again_it_does_what_it_does_undisturbed(
     name: str, fault: Fault, repetition: int, base: Path, undisturbed: Callable[[str], Any], tmp_path: Path
 ) -> None:

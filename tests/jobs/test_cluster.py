@@ -20,6 +20,8 @@ from plushsense.core.errors import ConfigError, PlushSenseError, TrainingError
 from plushsense.jobs.journal import Journal
 from plushsense.jobs.pool import Job, JobCallbacks, JobsSpec, run_jobs
 
+pytestmark = [pytest.mark.apart("ray"), pytest.mark.slow]
+
 SMALL = 80 * 2**20
 
 
@@ -81,6 +83,7 @@ def test_a_lost_node_changes_nothing(two_nodes: Any, tmp_path: Path, capfd: pyte
     two_nodes.add_node(num_cpus=1, object_store_memory=SMALL)
 
 
+@pytest.mark.exhaustive
 def test_what_a_job_raises_comes_through(two_nodes: Any, tmp_path: Path) -> None:
     jobs = [Job(f"job{n}", n) for n in range(4)]
     journal = Journal(tmp_path)

@@ -18,6 +18,8 @@ from plushsense.core.errors import ConfigError, PlushSenseError, TrainingError
 from plushsense.jobs.journal import Journal
 from plushsense.jobs.pool import Job, JobCallbacks, JobsSpec, run_jobs
 
+pytestmark = pytest.mark.slow
+
 HERE = Path(__file__).parent
 
 JOBS = [Job(f"job{n}", n) for n in range(5)]

@@ -13,6 +13,8 @@ torch = pytest.importorskip("torch")
 
 from plushsense.models.net import Net
 
+pytestmark = pytest.mark.apart("trainings")
+
 
 @pytest.fixture(autouse=True)
 def one_thread() -> None:

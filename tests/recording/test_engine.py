@@ -34,6 +34,8 @@ from plushsense.recording.session_files import SessionHead, discarded_recordings
 from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import StreamFile
 
+pytestmark = pytest.mark.slow
+
 LAYOUT = load_layout("plush-15")
 PROTOCOL = load_protocol("quick")
 SPEED = 50.0

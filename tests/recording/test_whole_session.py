@@ -122,6 +122,7 @@ def kill_and_check(out: Path, toy: Toy, after_s: float, speed: float, *words: st
     }
 
 
+@pytest.mark.exhaustive
 def test_killed_three_times(tmp_path: Path) -> None:
     """The last second of the stream may be missing, no finished recording is damaged, and it goes on to the end."""
     out, folder = tmp_path / "out", tmp_path / "out" / "S01" / "1"

@@ -20,6 +20,8 @@ from plushsense.reports import figures, quality, quality_figures
 from plushsense.reports.quality_figures import trim_page
 from plushsense.windows.cut import WindowSpec, cut_windows
 
+pytestmark = pytest.mark.slow
+
 ACCEL = load_layout("accel-3")
 
 
@@ -103,6 +105,7 @@ def test_accepted_findings_are_not_named(result: CheckReport) -> None:
     assert page.count('<tr class="accepted">') == len(result.findings)
 
 
+@pytest.mark.exhaustive
 def test_pictures_are_bounded_and_the_page_says_so(result: CheckReport, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "PICTURE_BYTES", 150_000)
     page = quality.render(result)

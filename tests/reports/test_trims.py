@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
@@ -8,6 +9,8 @@ from plushsense.dataset.store import Dataset
 from plushsense.dataset.trimming import accept_suggestions, refresh_trims, suggest_trims
 from plushsense.recording.simulate import simulate
 from plushsense.reports.quality_figures import PER_PAGE, save_trims, trim_page
+
+pytestmark = pytest.mark.slow
 
 
 def _dataset(folder: Path) -> Dataset:

@@ -24,6 +24,8 @@ from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from support.troubles import BAD, events_of, knowing_bundle, lived, reader_of, toy_frames
 
+pytestmark = pytest.mark.slow
+
 GATE = GateSettings((Signal(JERK, (0, 1, 2), lag=2, floor=20),), (Rule((Term(0, 160),), 3, 255, deaf=100),))
 HEALTH = HealthSettings((-1200, -1200, -1200), (1200, 1200, 1500), still_ms=400)
 SAFE = DecideSpec(smoothing_s=0.1, gate=GATE, health=HEALTH)

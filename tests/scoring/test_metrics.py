@@ -10,6 +10,8 @@ import pytest
 from plushsense.core.errors import BadInput
 from plushsense.scoring import metrics
 
+pytestmark = pytest.mark.apart("reidentification")
+
 # Truth in rows: class 2 is never there but once read; class 3 is there and never read.
 COUNTS = np.array([[8, 2, 0, 0], [1, 5, 1, 0], [0, 0, 0, 0], [2, 1, 0, 0]])
 

@@ -74,6 +74,7 @@ def test_a_flipped_byte_is_another_export(little: Workspace, tmp_path: Path) -> 
     assert folder_digest(tmp_path / "one") != before
 
 
+@pytest.mark.exhaustive
 def test_a_broken_export_is_found(little: Workspace, target_here: Callable[[str], str], tmp_path: Path) -> None:
     ps.export(little.bundles()[0], tmp_path / "one")
     flip(tmp_path / "one" / "plush_model.c")

@@ -37,6 +37,7 @@ def sideways(page: Any) -> int:
     return int(page.evaluate("() => document.documentElement.scrollWidth - document.documentElement.clientWidth"))
 
 
+@pytest.mark.exhaustive
 def test_export_verify_and_break(
     studio: Fixture, look: Fixture, shots: Fixture, home: Path, target_here: Fixture, tmp_path: Path
 ) -> None:
@@ -114,6 +115,7 @@ def test_export_verify_and_break(
     assert browser.complaints == [] and other.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
     home = tmp_path / "home"
     bundle_of(padding="causal").save(home / "bundles" / "causal.plush")

@@ -12,6 +12,8 @@ from plushsense.studio.app.workspace import DATASETS, Workspace
 from support.browsing import DESK, LONG_MS, TABLET, axe, marked
 from support.recorded import record
 
+pytestmark = pytest.mark.early
+
 Fixture = Callable[..., Any]
 
 
@@ -41,6 +43,7 @@ def test_from_nothing_to_a_data_set_by_one_click(studio: Fixture, look: Fixture,
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_stopping_work(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     page = look().open(studio().url)
     marked(page, "next-button").click()
@@ -54,6 +57,7 @@ def test_stopping_work(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     assert (tmp_path / "home" / "datasets" / "virtual toy" / "dataset.toml").is_file()
 
 
+@pytest.mark.exhaustive
 def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "home")
     record(workspace, "S01")
@@ -123,6 +127,7 @@ def test_data_sets_and_networks_are_renamed_discarded_and_deleted(studio: Fixtur
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture, server: Callable[[bytes], str]) -> None:
     one = studio("--speed", "10")
     browser = look()

@@ -23,6 +23,8 @@ from plushsense.studio.pages.train.verdict import figures, headline, limits, peo
 from plushsense.workflow.reporting import LEARNING, SCORES
 from support.study import evaluation
 
+pytestmark = pytest.mark.apart("hostile-results")
+
 HOSTILE = "<img src=x onerror='window.ran=1'>"
 ARCH = Arch.parse("14d1_19d2_19d4", (8, 12, 16))
 SCORED: dict[str, Any] = {

@@ -152,6 +152,7 @@ def test_files_and_a_folder_are_chosen(studio: Fixture, look: Fixture, furniture
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_files_are_dropped_and_what_is_missing_is_asked_in_latvian(
     studio: Fixture, look: Fixture, furniture: Path, tmp_path: Path
 ) -> None:

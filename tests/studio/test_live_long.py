@@ -27,6 +27,8 @@ from support.browsing import marked
 from support.requirements import LONG
 from support.trainings import train_apart
 
+pytestmark = pytest.mark.early
+
 Fixture = Callable[..., Any]
 SPEED = 10.0
 TOY_S = 600.0 if LONG else 240.0 if os.environ.get("PLUSHSENSE_REQUIRE") else 120.0
@@ -65,6 +67,7 @@ def played(bundle: Bundle) -> tuple[list[tuple[str, float, float]], list[tuple[f
     return done, list(events.values())
 
 
+@pytest.mark.exhaustive
 def test_every_gesture_is_seen_with_its_affect_and_nothing_grows(
     studio: Fixture, look: Fixture, reader: Path, tmp_path: Path
 ) -> None:

@@ -22,6 +22,8 @@ from plushsense.recording.session_files import SessionHead
 from support.browsing import DESK, TABLET, Look, axe, connected, marked
 from support.bundles import OTHER, odd_bundle
 
+pytestmark = pytest.mark.early
+
 Fixture = Callable[..., Any]
 PHONE = (390, 844)
 VIRTUAL = ("--device", "virtual://?person=31", "--speed", "2")
@@ -136,6 +138,7 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
     [("lv", False, TABLET), ("lv", True, TABLET), ("en", True, DESK)],
     ids=["lv-light-tablet", "lv-dark-tablet", "en-dark-desk"],
 )
+@pytest.mark.exhaustive_for("en-dark-desk", "lv-dark-tablet")
 def test_it_reads_well_in_any_light_and_language(
     language: str, dark: bool, size: tuple[int, int], studio: Fixture, look: Fixture, shots: Fixture, home: Path
 ) -> None:
@@ -148,6 +151,7 @@ def test_it_reads_well_in_any_light_and_language(
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture, look: Fixture, home: Path) -> None:
     import plushsense as ps
 
@@ -211,6 +215,7 @@ def toy() -> Iterator[Callable[[int], tuple[subprocess.Popen[str], str]]]:
         process.wait(20.0)
 
 
+@pytest.mark.exhaustive
 def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, home: Path, toy: Fixture) -> None:
     process, address = toy()
     browser = look()
@@ -227,6 +232,7 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, hom
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_a_toy_that_goes_away_while_the_page_is_behind(
     studio: Fixture, look: Fixture, home: Path, toy: Fixture
 ) -> None:
@@ -279,6 +285,7 @@ def test_a_toy_that_is_not_there_is_a_sentence(studio: Fixture, look: Fixture, h
         assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_two_tabs_and_a_reload_show_the_present(studio: Fixture, look: Fixture, home: Path) -> None:
     url = studio(*VIRTUAL, home=home).url
     browser = look()
@@ -325,6 +332,7 @@ def record_simulated(folder: Path) -> None:
     shutil.rmtree(folder.parent / "made")
 
 
+@pytest.mark.exhaustive
 def test_the_network_is_adapted_to_recordings_of_the_person(
     studio: Fixture, look: Fixture, shots: Fixture, home: Path
 ) -> None:
@@ -368,6 +376,7 @@ def test_the_network_is_adapted_to_recordings_of_the_person(
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_a_new_person_is_led_through_the_validation(studio: Fixture, look: Fixture, shots: Fixture, home: Path) -> None:
     url = studio("--device", "virtual://?person=31", "--speed", "3", home=home).url
     browser = look(PHONE, True, "lv", touch=True)

@@ -25,6 +25,8 @@ from support.requirements import missing
 from support.sharing import built_once
 from support.trainings import evaluate_apart
 
+pytestmark = pytest.mark.early
+
 Fixture = Callable[..., Any]
 KEPT = os.environ.get("PLUSHSENSE_SHOTS", "")
 MOST_BYTES = 100_000
@@ -203,6 +205,9 @@ def test_every_page_has_a_scene() -> None:
 @pytest.mark.parametrize("view", VIEWS, ids=lambda v: v.name)
 # A recording and a live view go on after their pictures and would slow down the other pages.
 @pytest.mark.parametrize("name", sorted(SCENES, key=lambda name: name in ("record", "live")))
+@pytest.mark.exhaustive_for(
+    "*-phone-dark-lv", "*-tablet-light-lv", "*-wide-dark-en", "export-desk-*", "live-desk-*", "record-desk-*"
+)
 def test_a_page_reads_well(name: str, view: View, furnished: Studio, look: Fixture) -> None:
     browser: Look = look(view.size, view.dark, view.language, touch=view.size in (TABLET, PHONE))
     page = browser.open(_address(name, view, furnished))

@@ -20,6 +20,7 @@ Fixture = Callable[..., Any]
 pytestmark = pytest.mark.usefixtures("publish_tools")
 
 
+@pytest.mark.exhaustive
 def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture, few: Path, tmp_path: Path) -> None:
     url = studio(home=few).url
     browser = look()
@@ -99,6 +100,7 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     assert browser.complaints == [] and other.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fixture, few: Path) -> None:
     head = few / "datasets" / "virtual" / "dataset.toml"
     silent = head.read_text("utf-8").replace('consent = "nobody: a simulation"', 'consent = ""')

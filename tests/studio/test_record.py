@@ -15,6 +15,8 @@ from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
 from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, stop, take, whats
 from support.waiting import until
 
+pytestmark = pytest.mark.early
+
 if TYPE_CHECKING:
     from playwright.sync_api import Page, WebSocketRoute
 
@@ -22,6 +24,7 @@ Fixture = Callable[..., Any]
 SPEED = ("--device", CALM, "--speed", "10")
 
 
+@pytest.mark.exhaustive
 def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     server, browser = studio(*SPEED), look(own=True)
     # What sounds: each tone is an oscillator.
@@ -113,6 +116,7 @@ def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_every_page_names_the_session_that_is_being_recorded(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     server, browser = studio(*SPEED), look(TABLET)
     home = browser.open(server.url)
@@ -205,6 +209,7 @@ def test_an_ended_session_is_finished_renamed_discarded_and_restored(
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_what_is_typed_is_no_command(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     server, browser = studio(*SPEED), look()
     page = begun(browser.open(server.url + "/record"), server.url, "S01")
@@ -227,6 +232,7 @@ def test_what_is_typed_is_no_command(studio: Fixture, look: Fixture, tmp_path: P
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     own = tmp_path / "home" / "protocols" / "mine.toml"
     own.parent.mkdir(parents=True)
@@ -326,6 +332,7 @@ def own_list(page: Page) -> None:
     marked(page, "discard-protocol").wait_for()
 
 
+@pytest.mark.exhaustive
 def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     # At this speed nobody's recording ends by itself before 20 s.
     server, browser = studio("--device", CALM, "--speed", "3"), look(own=True)
@@ -434,6 +441,7 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="Windows cannot stop a process for a while")
+@pytest.mark.exhaustive
 def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: Fixture, shots: Fixture) -> None:
     server, browser = studio("--device", CALM), look()
     page = begun(browser.open(server.url + "/record"), server.url, "S01")
@@ -468,6 +476,7 @@ def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: 
     assert not [c for c in browser.complaints if "Failed to" not in c and "WebSocket" not in c]
 
 
+@pytest.mark.exhaustive
 def test_it_speaks_latvian_and_fits_a_phone(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
     server = studio("--device", CALM, "--speed", "3")
     for number, (language, dark, size) in enumerate((("lv", True, PHONE), ("en", False, DESK))):

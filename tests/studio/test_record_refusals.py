@@ -32,6 +32,8 @@ from support.recording_pages import (
 )
 from support.waiting import until
 
+pytestmark = pytest.mark.early
+
 Fixture = Callable[..., Any]
 
 
@@ -59,6 +61,7 @@ def reconnected(page: Any) -> int:
     return int(found[1])
 
 
+@pytest.mark.exhaustive
 def test_a_session_that_cannot_begin(
     studio: Fixture, look: Fixture, pty_possible: None, tmp_path: Path, shots: Fixture
 ) -> None:
@@ -125,6 +128,7 @@ def test_a_session_that_cannot_begin(
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp_path: Path, shots: Fixture) -> None:
     home = tmp_path / "home"
     with tcp_toy() as url:

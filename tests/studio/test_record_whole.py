@@ -21,7 +21,7 @@ from support.requirements import LONG
 from support.waiting import until
 
 Fixture = Callable[..., Any]
-pytestmark = pytest.mark.usefixtures("pty_possible")
+pytestmark = [pytest.mark.usefixtures("pty_possible"), pytest.mark.early]
 SPEED = 20.0
 REPETITIONS = 3 if LONG else 1
 TOTAL = REPETITIONS * len(GESTURES)
@@ -33,6 +33,7 @@ def logged(folder: Path) -> list[str]:
     return [e.kind for e in read_events(folder)]
 
 
+@pytest.mark.exhaustive
 def test_a_whole_session_by_the_space_bar(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     folder = tmp_path / "home" / "recordings" / "S01" / "1"
     own = tmp_path / "home" / "protocols" / "whole.toml"

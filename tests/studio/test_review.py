@@ -19,6 +19,8 @@ from plushsense.studio.app.workspace import Workspace
 from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
 from support.reviewed import ROW_S, made, marks, raw_hash, streamed
 
+pytestmark = pytest.mark.early
+
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
@@ -74,6 +76,7 @@ def x_of(page: Page, fraction: float) -> tuple[float, dict[str, int]]:
 
 
 @pytest.mark.parametrize("size", [DESK, TABLET, (1600, 900)])
+@pytest.mark.exhaustive
 def test_a_click_moves_the_mark_to_within_a_sample(
     size: tuple[int, int], waves: Path, studio: Fixture, look: Fixture
 ) -> None:
@@ -308,6 +311,7 @@ def test_a_finding_is_accepted_with_a_reason(waves: Path, studio: Fixture, look:
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_the_table_filters_sorts_and_says_what_it_shows(
     waves: Path, studio: Fixture, look: Fixture, shots: Fixture
 ) -> None:
@@ -349,6 +353,7 @@ def test_the_table_filters_sorts_and_says_what_it_shows(
     assert "7.50 s" in page.locator("[data-test=table] tbody tr").first.inner_text()
 
 
+@pytest.mark.exhaustive
 def test_decisions_about_many_recordings(waves: Path, studio: Fixture, look: Fixture) -> None:
     raw = raw_hash(waves)
     browser = look()
@@ -412,6 +417,7 @@ def test_decisions_about_many_recordings(waves: Path, studio: Fixture, look: Fix
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
     url = studio(home=waves.parents[1]).url
     longest = max(open_dataset(waves).recordings, key=lambda r: r.rows).id
@@ -449,6 +455,7 @@ def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: F
     page.get_by_text("Undone: setting another gesture").wait_for()
 
 
+@pytest.mark.exhaustive
 def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
     url = studio(home=waves.parents[1]).url
     longest = max(open_dataset(waves).recordings, key=lambda r: r.rows).id
@@ -472,6 +479,7 @@ def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixtu
     assert opened(page) == longest
 
 
+@pytest.mark.exhaustive
 def test_one_recording_has_no_violation_in_any_light(
     waves: Path, studio: Fixture, look: Fixture, shots: Fixture
 ) -> None:
@@ -497,6 +505,7 @@ def test_one_recording_has_no_violation_in_any_light(
     assert marks(waves) == []
 
 
+@pytest.mark.exhaustive
 def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> None:
     started = studio(home=waves.parents[1])
     ids = [r.id for r in open_dataset(waves).recordings if r.gesture == "Wave"]
@@ -551,6 +560,7 @@ def test_a_folder_that_cannot_be_written(waves: Path, studio: Fixture, look: Fix
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_two_tabs_show_the_same_and_do_not_fight(waves: Path, studio: Fixture, look: Fixture) -> None:
     browser = look()
     url = studio(home=waves.parents[1]).url + "/review?view=one&gesture=Wave"
@@ -707,6 +717,7 @@ def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_real_recordings_one_after_the_other(
     real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture, shots: Fixture
 ) -> None:

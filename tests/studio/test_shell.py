@@ -32,6 +32,8 @@ from support.browsing import DESK, PHONE, TABLET, Studio, axe, connected, marked
 from support.recorded import record
 from support.study import evaluation
 
+pytestmark = pytest.mark.early
+
 Fixture = Callable[..., Any]
 _IN_VIEW = "e => { const r = e.getBoundingClientRect(); return r.left >= 0 && r.right <= innerWidth }"
 
@@ -50,6 +52,7 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     [("en", False, DESK), ("lv", True, PHONE)],
     ids=["en-light-desk", "lv-dark-phone"],
 )
+@pytest.mark.exhaustive_for("en-light-desk")
 def test_pages_open_without_complaint(
     language: str, dark: bool, size: tuple[int, int], empty: str, look: Fixture, shots: Fixture
 ) -> None:
@@ -89,6 +92,7 @@ def test_a_first_page_is_small(empty: str, look: Fixture) -> None:
     assert 100_000 < sum(sizes) <= 400_000
 
 
+@pytest.mark.exhaustive
 def test_help_and_tour(empty: str, look: Fixture) -> None:
     browser = look()
     page = browser.open(empty + PAGES["publish"])
@@ -108,6 +112,7 @@ def test_help_and_tour(empty: str, look: Fixture) -> None:
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_language_and_light_are_kept(empty: str, look: Fixture) -> None:
     browser = look()
     page = browser.open(empty)
@@ -181,6 +186,7 @@ def test_the_first_key_leads_to_the_content(empty: str, look: Fixture) -> None:
     assert page.locator("[aria-current=page]").inner_text() == "Publish"
 
 
+@pytest.mark.exhaustive
 def test_the_bar_is_one_row_on_a_tablet(empty: str, look: Fixture) -> None:
     for language in ("en", "lv"):
         page = look(TABLET, language=language, touch=True).open(empty)

@@ -18,11 +18,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import ZipFile
 
+import pytest
+
 from plushsense.devices.virtual.session import GESTURES
 from plushsense.studio.app.words import Words
 from support.browsing import LONG_MS, axe, connected, english, marked
 from support.recording_pages import heard, showing, start_recording
 from support.requirements import LONG
+
+pytestmark = pytest.mark.early
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

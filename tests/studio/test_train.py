@@ -22,6 +22,8 @@ from support.browsing import LONG_MS, TABLET, axe, marked
 from support.sharing import built_once
 from support.trainings import evaluate_apart
 
+pytestmark = pytest.mark.early
+
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
@@ -73,6 +75,7 @@ def command(page: Page) -> list[str]:
     return shlex.split(marked(page, "command").text_content())
 
 
+@pytest.mark.exhaustive
 def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     studio: Fixture, look: Fixture, shots: Fixture, home: Path
 ) -> None:
@@ -181,6 +184,7 @@ def leaky(light: Path) -> Path:
     return light
 
 
+@pytest.mark.exhaustive
 def test_a_proof_its_table_and_the_recordings_of_a_cell(
     studio: Fixture, look: Fixture, shots: Fixture, leaky: Path
 ) -> None:
@@ -310,6 +314,7 @@ split = "windows:holdout"
 """
 
 
+@pytest.mark.exhaustive
 def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     studio: Fixture, look: Fixture, shots: Fixture, light: Path
 ) -> None:
@@ -375,6 +380,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_what_is_wrong_is_named_beside_its_field(studio: Fixture, look: Fixture, shots: Fixture, home: Path) -> None:
     little = (home / "bundles" / "little.plush").read_bytes()
     folder = home / "datasets" / "virtual"
@@ -425,6 +431,7 @@ def test_what_is_wrong_is_named_beside_its_field(studio: Fixture, look: Fixture,
     assert browser.complaints == []
 
 
+@pytest.mark.exhaustive
 def test_one_button_makes_a_network_that_a_stop_does_not_lose(
     studio: Fixture, look: Fixture, shots: Fixture, few: Path
 ) -> None:

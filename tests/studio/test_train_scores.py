@@ -31,12 +31,15 @@ from plushsense.studio.pages.train.results import (
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits, of_ten, people_table
 
+pytestmark = [pytest.mark.apart("train-scores"), pytest.mark.early]
+
 
 def row_of(home: Path, kind: str) -> ResultRow:
     return next(r for r in StoredResults(Workspace(home)).rows() if r.kind == kind)
 
 
 # The first of the file: after another one its process would grow beyond 600 MB.
+@pytest.mark.exhaustive
 def test_a_training_has_the_same_figure_everywhere(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bundle = home / "bundles" / "little.plush"
     words = [

@@ -25,6 +25,8 @@ from plushsense.studio.pages.live.feed import VIEW_TEXTS
 from plushsense.studio.pages.review.review import CHECK_NAMES
 from plushsense.studio.pages.review.table_view import ADVICE
 
+pytestmark = pytest.mark.apart("hostile-results")
+
 PACKAGE = Path(str(resources.files("plushsense")))
 FILES = sorted((PACKAGE / "studio" / "locale").glob("*.po"))
 TRANSLATORS = {"words", "_words", "w"}

@@ -1,8 +1,9 @@
 """Test files in a process of their own beside a worker: what they load and keep is gone when it ends.
 
 A worker collects all tests of its run and keeps what one of them has loaded: scikit-learn 120 MB, MLflow
-190 MB. The files of a line of `GROUPS` run in a fork of a server process, which has collected the files of all lines.
-The fork ends when the worker comes to another line, or after a test that leaves more than `ENOUGH_MB` allocated.
+190 MB. The files with one mark ``pytestmark = pytest.mark.apart("NAME")`` run in a fork of a server process, which has
+collected all marked files. The fork ends when the worker comes to another name, or after a test that leaves more than
+`ENOUGH_MB` allocated. Such a file imports what it shares a process for within its tests: see `_refuse_threads`.
 
 Without workers (``pytest tests/...``, coverage) all tests run in the one process.
 """
@@ -25,45 +26,6 @@ from _pytest.runner import runtestprotocol
 from support.memory import memory_mb
 
 TESTS = Path(__file__).parents[1]
-# Each line is one fork, for files that load the same or share fixtures.
-GROUPS = tuple(
-    tuple(files.split())
-    for files in (
-        "cli/test_baselines.py",
-        "cli/test_publish.py dataset/publishing/test_checking.py dataset/publishing/test_contents.py"
-        " dataset/publishing/test_package.py",
-        "dataset/importing/test_importers_fuzz.py",
-        "dataset/publishing/test_readers.py",
-        "evaluation/test_reidentification.py scoring/test_metrics.py",
-        "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py"
-        " experiments/streams/test_predictions.py",
-        "experiments/sweep/test_cluster.py experiments/sweep/test_mlflow.py experiments/sweep/test_report.py"
-        " experiments/sweep/test_halving_run.py experiments/sweep/test_run.py",
-        "jobs/test_cluster.py",
-        "studio/test_hostile_results.py studio/test_words.py",
-        "studio/test_train_scores.py",
-        "test_pages.py test_questions.py",
-        "tuning/test_gate.py",
-        "windows/test_units.py",
-        "workflow/test_demo.py",
-        "workflow/test_estimator.py workflow/test_exchange.py",
-        "workflow/test_paper.py",
-        # The real recordings.
-        "dataset/importing/test_proposals.py dataset/quality/test_checks.py dataset/test_labelling.py"
-        " devices/test_virtual.py",
-        # Trainings in the process of the tests, 100 MB each time one is under way and afterwards.
-        "cli/test_adapt.py cli/test_extending.py cli/test_live.py cli/test_main.py cli/test_paper_page.py"
-        " cli/test_protocol.py cli/test_stream_eval.py cli/test_trim.py"
-        " experiments/analysis/test_comparison.py experiments/analysis/test_merging.py"
-        " experiments/streams/test_training.py faults/test_interrupted.py"
-        " models/test_net.py training/fast/test_net.py training/test_fit.py"
-        " workflow/test_api.py workflow/test_budget.py workflow/test_estimate.py workflow/test_calibration.py"
-        " workflow/test_fitting_decisions.py"
-        " workflow/test_forget_beside.py"
-        " workflow/test_reporting.py workflow/test_resuming.py",
-    )
-)
-_GROUP_OF = {file: group for group in GROUPS for file in group}
 ENOUGH_MB = 340
 _CHANNEL = "TESTS_APART"
 SHARED = "TESTS_SHARED"
@@ -124,15 +86,14 @@ class Worker:
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
         """Run a test of these files in the process of its group."""
-        place = _place(item)
-        group = _GROUP_OF.get(place)
-        if group is None:
+        place, group = _place(item), group_of(item)
+        if not group:
             return None
         if self.apart is None or self.apart.process.poll() is not None:
             base = item.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
-            files = dict.fromkeys(file for file in map(_place, item.session.items) if file in _GROUP_OF)
+            files = dict.fromkeys(_place(one) for one in item.session.items if group_of(one))
             self.apart = Apart(list(files), item.config, base)
-        following = nextitem.nodeid if nextitem is not None and _GROUP_OF.get(_place(nextitem)) is group else None
+        following = nextitem.nodeid if nextitem is not None and group_of(nextitem) == group else None
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         reports, mb = self.apart.run(item, following)
         for report in reports:
@@ -211,6 +172,12 @@ def _asked(channel: Connection) -> Asked | None:
     with contextlib.suppress(EOFError, OSError):
         return channel.recv()  # type: ignore[no-any-return]
     return None
+
+
+def group_of(item: pytest.Item) -> str:
+    """Return the name of the processes that a test shares with others, empty if it runs in the worker."""
+    mark = item.get_closest_marker("apart")
+    return "" if mark is None else str(mark.args[0])
 
 
 def _place(item: pytest.Item) -> str:

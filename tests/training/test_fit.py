@@ -21,6 +21,8 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra tra
 from plushsense.training.engine import Adam, FitState
 from plushsense.training.fit import fit, predict, with_hard_negatives
 
+pytestmark = pytest.mark.apart("trainings")
+
 Make = Callable[..., WindowSet]
 SPEC = TrainSpec(epochs=12, batch=16, device="cpu")
 

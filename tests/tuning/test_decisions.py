@@ -30,6 +30,8 @@ from plushsense.tuning.decisions import (
 from plushsense.tuning.events import OTHER
 from plushsense.windows.clock import row_times_us
 
+pytestmark = pytest.mark.slow
+
 ACCEL = load_layout("accel-3")
 TWO = GestureSet("two", (Gesture("a"), Gesture("b", idle=True)))
 

@@ -27,6 +27,8 @@ from plushsense.windows.clock import resample
 from plushsense.windows.features import network_inputs
 from plushsense.workflow.api import simulate
 
+pytestmark = [pytest.mark.apart("gate"), pytest.mark.slow]
+
 PLUSH = load_layout("plush-15")
 BLOWS = ("Tail hit 1", "Tail hit 2", "Tail pull")
 STRANGERS = range(101, 106)
@@ -142,12 +144,14 @@ def test_strangers_blows_are_answered_at_once_and_caresses_are_not_called_blows(
     ],
     ids=["damp and dry days", "the same day", "damp skin", "small hands", "large hands"],
 )
+@pytest.mark.exhaustive_for("damp skin", "small hands", "the same day")
 def test_neither_humidity_nor_the_hand_matters_much(fitted: GateFit, world: World) -> None:
     quick, gentle, _ = on_strangers(fitted.settings, world)
     assert quick >= 0.85
     assert gentle <= 0.03
 
 
+@pytest.mark.exhaustive
 def test_a_lower_rate_allows_fewer_false_alarms(virtual: Dataset) -> None:
     few = fit_gate(virtual, virtual.gestures, virtual.subjects[:3], false_alarms_per_hour=0.1).report
     many = fit_gate(virtual, virtual.gestures, virtual.subjects[:3], false_alarms_per_hour=60.0).report

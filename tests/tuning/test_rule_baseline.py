@@ -25,6 +25,8 @@ from plushsense.tuning.rule_baseline import (
 )
 from plushsense.workflow.api import simulate
 
+pytestmark = pytest.mark.slow
+
 PLUSH = load_layout("plush-15")
 SETTINGS = RuleBaselineSettings(shock=40_000, touch_shock=4_000, swing=300)
 
@@ -99,6 +101,7 @@ def virtual(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return open_dataset(folder / "DS")
 
 
+@pytest.mark.exhaustive
 def test_tuned_by_hand_they_do_what_the_paper_saw(virtual: Dataset) -> None:
     """A simulation: blows at once, most broad strokes, hardly any fine scratch, nothing to holding."""
     settings = fit_rule_baseline(virtual, virtual.gestures, virtual.subjects)

@@ -26,6 +26,8 @@ from plushsense.windows.cut import WindowSet, WindowSpec
 from plushsense.windows.features import InputUnits, Scaler, statistics
 from plushsense.workflow.exchange import to_panel, to_torch
 
+pytestmark = pytest.mark.apart("units")
+
 Floats = NDArray[np.float64]
 ROWS = WindowSpec(context="rows", window_s=1.0)
 

@@ -21,6 +21,8 @@ from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people
 from support.small_dataset import Cli
 
+pytestmark = pytest.mark.apart("trainings")
+
 
 def test_the_public_api_is_small_and_all_of_its_names_load() -> None:
     assert len(ps.__all__) <= 14

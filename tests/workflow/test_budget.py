@@ -15,6 +15,8 @@ from plushsense.workflow.budget import TrainingCost, choose_plan, curve_sizes, l
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.reporting import load_evaluation
 
+pytestmark = pytest.mark.apart("trainings")
+
 
 def test_a_plan_uses_the_time_for_folds_and_the_learning_curve_first() -> None:
     cost = TrainingCost(window_epoch_s=1e-4, windows=6000, side_by_side=2)

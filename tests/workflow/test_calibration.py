@@ -17,6 +17,8 @@ from plushsense.windows.cut import WindowSpec
 from plushsense.workflow.export import calibrated_on
 from plushsense.workflow.preparation import choose_classes, windows_for
 
+pytestmark = pytest.mark.apart("trainings")
+
 
 def test_training_calibrates_on_the_windows_it_trained_on_and_no_others(dataset: Dataset) -> None:
     bundle = ps.train(dataset, epochs=1, filters=(4, 4, 4), patience=9).bundle

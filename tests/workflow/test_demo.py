@@ -16,6 +16,8 @@ from plushsense.workflow import demo
 from plushsense.workflow.demo import DemoSize
 from support.traced import SocketTrace
 
+pytestmark = pytest.mark.apart("demo")
+
 REPO = Path(__file__).resolve().parents[2]
 TINY = DemoSize(people=4, repetitions=1, epochs=1, folds=2, live_s=15.0)
 
@@ -61,6 +63,7 @@ def test_demo_touches_no_folder_of_yours(cli: Callable[..., Any], tmp_path: Path
     assert sorted(p.name for p in tmp_path.iterdir()) == ["thesis.txt"]
 
 
+@pytest.mark.exhaustive
 def test_the_quickstart_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = REPO / "examples" / "quickstart.py"
     assert len(path.read_text().splitlines()) <= 40

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 import plushsense as ps
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.sweep.run import preview
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.estimate import PASSES, preview_evaluation, preview_training
 from plushsense.workflow.preparation import prepare
+
+pytestmark = pytest.mark.apart("trainings")
 
 CONFIG = from_settings(filters=(4, 4, 4), context="loop", epochs=2)
 

@@ -24,7 +24,7 @@ from plushsense.models.reference import softmax
 from plushsense.scoring.splits import Splitter, parse_split
 from plushsense.windows.cut import WindowSpec
 
-pytestmark = pytest.mark.usefixtures("scikit_learn")
+pytestmark = [pytest.mark.usefixtures("scikit_learn"), pytest.mark.apart("estimator")]
 SRC = Path(__file__).resolve().parents[2] / "src"
 
 TINY: dict[str, Any] = {"arch": "3", "filters": (4,), "padding": "causal", "epochs": 20, "learning_rate": 0.03}
@@ -84,6 +84,7 @@ def test_it_learns_and_answers_in_every_form() -> None:
     ],
     ids=["text", "int", "bool", "float", "case", "empty", "object"],
 )
+@pytest.mark.exhaustive_for("bool", "case", "empty", "int")
 def test_labels_keep_their_type(labels: Any, tmp_path: Path) -> None:
     x, y, _ = waves()
     model = small().fit(x, labels[y])

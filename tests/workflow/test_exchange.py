@@ -14,6 +14,8 @@ from plushsense.dataset.store import Dataset
 from plushsense.workflow.exchange import to_hugging_face, to_pandas, to_panel, to_torch, to_xdf
 from support.requirements import missing
 
+pytestmark = pytest.mark.apart("estimator")
+
 
 @pytest.fixture
 def tables() -> None:

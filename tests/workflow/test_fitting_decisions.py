@@ -7,10 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import plushsense as ps
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.runtime.decisions import DecideSpec
+
+pytestmark = pytest.mark.apart("trainings")
 
 Cli = Callable[..., Any]
 SMALL = ("--filters", "4,4,4", "--epochs", "6")

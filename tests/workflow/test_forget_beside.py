@@ -25,6 +25,8 @@ from plushsense.experiments.sweep.run import sweep
 from plushsense.workflow.api import unfinished
 from plushsense.workflow.datasets import PublishSpec, share_copy
 
+pytestmark = pytest.mark.apart("trainings")
+
 PERSON = "Yv0nne-77"
 SMALL: dict[str, Any] = {"filters": (2, 3, 3), "context": "loop", "epochs": 2, "workers": 1}
 GRID: dict[str, Any] = {
@@ -129,6 +131,16 @@ REFUSED = r"removed from '.*' \(plushsense forget\) while this ran.*run it again
 
 @pytest.mark.parametrize("when", [lambda *_: True, ended], ids=["early", "late"])
 @pytest.mark.parametrize("run", RUNS, ids=lambda run: run.__name__.removeprefix("run_"))
+@pytest.mark.exhaustive_for(
+    "baselines-early",
+    "baselines-late",
+    "evaluate_in_processes-early",
+    "evaluate_in_processes-late",
+    "halving-early",
+    "streams-early",
+    "streams-late",
+    "sweep-early",
+)
 def test_who_is_forgotten_meanwhile_does_not_come_back(
     folder: Path, run: Callable[[Dataset, Path, Hook], None], when: Callable[..., bool]
 ) -> None:

@@ -22,6 +22,8 @@ TESTS = Path(__file__).resolve().parents[1]
 
 from support.archive import DELAYS, make_archive
 
+pytestmark = pytest.mark.apart("paper")
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -126,6 +128,7 @@ def test_the_table_is_made_and_goes_on_where_it_stood(
     assert capsys.readouterr().out == said
 
 
+@pytest.mark.exhaustive
 def test_the_papers_result_with_pca_stands_beside_pca_without_scaling(
     made: Path, script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,6 +153,7 @@ def test_the_papers_result_with_pca_stands_beside_pca_without_scaling(
     ]
 
 
+@pytest.mark.exhaustive
 def test_without_a_mapping_the_people_are_asked_for(
     made: Path, script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

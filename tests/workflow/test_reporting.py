@@ -7,9 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import plushsense as ps
 from plushsense.dataset.store import Dataset
 from plushsense.workflow.datasets import forget
+
+pytestmark = pytest.mark.apart("trainings")
 
 Cli = Callable[..., Any]
 

@@ -15,6 +15,8 @@ import plushsense as ps
 from plushsense.dataset.store import Dataset
 from plushsense.workflow.api import unfinished
 
+pytestmark = pytest.mark.apart("trainings")
+
 SMALL: dict[str, Any] = {"filters": (4, 4, 4), "context": "loop", "seed": 3}
 
 

@@ -24,6 +24,8 @@ from plushsense.core.recorder_csv import Frames, format_rows, read_recording, re
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 
+pytestmark = [pytest.mark.apart("import-fuzz"), pytest.mark.slow]
+
 ACCEL = load_layout("accel-3")
 PHONE = load_layout("phone-6")
 Writer = Callable[..., Path]

@@ -25,6 +25,8 @@ from plushsense.windows.cut import WindowSpec, cut_windows
 from plushsense.windows.features import Scaler
 from support.accelerometers import ACCEL, analogue
 
+pytestmark = pytest.mark.apart("real-recordings")
+
 
 @pytest.mark.parametrize(("zero", "one_g"), [(330.0, 68.0), (511.0, 102.0)])
 def test_the_zero_of_an_analogue_accelerometer_is_found_and_adopted(tmp_path: Path, zero: float, one_g: float) -> None:

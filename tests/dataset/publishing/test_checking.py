@@ -19,6 +19,8 @@ from plushsense.dataset.publishing.package import PublishResult
 from plushsense.dataset.publishing.tables import write_checksums, write_zip
 from support.requirements import LONG
 
+pytestmark = pytest.mark.apart("publishing")
+
 Damage = Callable[[Path], None]
 
 

@@ -16,6 +16,8 @@ from plushsense.dataset.publishing.package import PublishResult
 from plushsense.dataset.store import Dataset
 from support.toys import KEY, made_of
 
+pytestmark = pytest.mark.apart("publishing")
+
 NOW = 1_700_000_000_000
 
 

@@ -21,6 +21,8 @@ from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import Dataset
 from support.toys import KEY, SECRETS, made_of, make
 
+pytestmark = pytest.mark.apart("publishing")
+
 
 def test_every_validator_agrees(package: PublishResult) -> None:
     assert package.checked.problems == []

@@ -23,6 +23,8 @@ from plushsense.dataset.store import Dataset, PersonInfo, write_people
 from support.requirements import missing
 from support.toys import KEY, made_of
 
+pytestmark = pytest.mark.apart("readers")
+
 NOW = 1_700_000_000_000
 ROWS = 30
 LABELS = (

@@ -34,6 +34,8 @@ from plushsense.dataset.store import Dataset
 from plushsense.recording.simulate import simulate
 from plushsense.studio.app.words import Words
 
+pytestmark = pytest.mark.apart("real-recordings")
+
 PLUSH = load_layout("plush-15")
 LABELS = ("Back stroke 1", "Head stroke 1", "Tail tap 1", "Hold strong")
 TOUCHED = (8, 3, 7, 9)

@@ -67,6 +67,7 @@ def verified(capsys: pytest.CaptureFixture[str], export: Path, url: str) -> tupl
 
 
 @pytest.mark.parametrize(("target", "way"), EACH_WAY)
+@pytest.mark.exhaustive_for("cortex-m4-tcp", "riscv32-pty")
 def test_a_chip_of_qemu_answers_over_its_uart(
     target: str,
     way: str,
@@ -175,6 +176,7 @@ def served(program: Path | None, sent: Change = bytes, received: Change = bytes)
             assert process.wait(10) == 0, "a sanitizer complained"
 
 
+@pytest.mark.exhaustive
 def test_scenarios_go_over_the_link_too(export: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With models of their own. The messages of a boot loader come first."""
     first = [b"ets Jul 29 2019 12:21:46\r\nrst:0x1 (POWERON_RESET) PV\x00PVPP"]

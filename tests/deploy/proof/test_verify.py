@@ -40,6 +40,8 @@ from support.exports import bundle_of, exported
 from support.outcomes import all_outcomes, outcomes_of
 from support.requirements import LONG
 
+pytestmark = pytest.mark.early
+
 EMULATED = [name for name in TARGETS if name != "host"]
 
 
@@ -90,6 +92,7 @@ def edit(path: Path, old: str, new: str) -> None:
 # ---- It holds ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.exhaustive
 def test_every_way_to_compile_on_the_host(all_compilers: None, small: Path) -> None:
     done = verify(Export(small), ["host"])
     assert done.passed and done.mismatches == 0 and done.first is None
@@ -102,6 +105,7 @@ def test_every_way_to_compile_on_the_host(all_compilers: None, small: Path) -> N
     assert min(rows[:-1]) > 500 and {r.vectors for r in done.runs} == {sum(rows)}
 
 
+@pytest.mark.exhaustive
 def test_a_last_layer_that_was_adapted_and_rules_that_were_fitted(c_compiler: str, tmp_path: Path) -> None:
     """As `adapt` and the fitting of settings leave a bundle: other dense weights, re-quantised, and every rule."""
     plain = bundle_of("plush-15", "9d1_5d2", "4,6")
@@ -162,6 +166,7 @@ ON_TWO_CHIPS = {"four-layers-6": (0, 2), "vectors-13": (1, 3)}
 
 
 @pytest.mark.parametrize("name", MAIN)
+@pytest.mark.exhaustive_for("four-layers-6", "one-layer-8", "paper-11", "vectors-13", "vectors-3")
 def test_the_same_on_every_chip(emulators: None, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Golden vectors of all networks; test scenarios of three, with and without valid ranges, as all have the rules.
 
@@ -187,6 +192,7 @@ def test_the_same_on_every_chip(emulators: None, tmp_path: Path, name: str, monk
 
 
 @pytest.mark.parametrize("each", ["kind", "all"])
+@pytest.mark.exhaustive_for("all")
 def test_every_fault_is_caught_on_the_host(
     each: str, c_compiler: str, small: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -209,6 +215,7 @@ def test_every_fault_is_caught_on_the_host(
     assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.mutants)
 
 
+@pytest.mark.exhaustive
 def test_every_fault_of_a_vector_layer_is_caught(c_compiler: str, tmp_path: Path) -> None:
     export = Export(exported(tmp_path / "out", bundle_of("accel-3", "v14_19d2", "4,8")))
     names = {"one weight of the vector layer by one", *(m.name for m in source_mutants() if m.when == "vectors")}
@@ -216,6 +223,7 @@ def test_every_fault_of_a_vector_layer_is_caught(c_compiler: str, tmp_path: Path
     assert {f.name for f in done.mutants if f.caught} == names and done.passed
 
 
+@pytest.mark.exhaustive
 def test_a_fault_of_the_rules_that_no_scenario_shows_is_no_defect_of_the_c(
     c_compiler: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,6 +260,7 @@ def test_scenarios_have_sensors_that_are_stuck_where_they_may_be(small: Path) ->
     list(zip(EMULATED, ("shift", "index", "rounding", "index", "clamp"), strict=True)),
     ids=EMULATED,
 )
+@pytest.mark.exhaustive_for("cortex-m0", "cortex-m33", "cortex-m4", "riscv32")
 def test_faults_are_caught_on_every_chip(emulators: None, small: Path, target: str, second: str) -> None:
     """A weight on each of them, and another kind of fault: on the host each kind is caught."""
     chosen = {"one weight of layer 1 by one", "one shift of layer 2 by one"}
@@ -378,6 +387,7 @@ def test_an_image_that_was_edited(c_compiler: str, own: Path) -> None:
         Export(own).made_up(10)
 
 
+@pytest.mark.exhaustive
 def test_without_smoothing_no_mutant_is_applied_that_cannot_show(c_compiler: str, tmp_path: Path) -> None:
     """Nor one that the toy would only refuse. Those of the rules show in scenarios, which have models of their own."""
     bundle = replace(bundle_of("plush-15", "9d1_5d2", "4,6"), decision={"smoothing_s": 0})
@@ -489,6 +499,7 @@ def test_a_header_beside_the_export_is_not_compiled(
 # ---- Recordings, long streams ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.exhaustive
 def test_recordings_go_through_the_c(
     c_compiler: str, two_settings: None, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,6 +12,8 @@ import pytest
 
 from plushsense.dataset.store import Dataset
 
+pytestmark = pytest.mark.apart("trainings")
+
 Cli = Callable[..., Any]
 
 

@@ -17,6 +17,8 @@ from plushsense.experiments.analysis import merging
 from plushsense.experiments.analysis.merging import merge_path
 from plushsense.models.bundle import Bundle
 
+pytestmark = pytest.mark.apart("trainings")
+
 Cli = Callable[..., Any]
 SET = GestureSet(
     "toy",
@@ -83,6 +85,7 @@ def test_the_largest_class_is_that_of_the_people_who_are_scored() -> None:
     assert list(merging._named(SET, None)) == ["family", "affect"], "plush-13 merges nothing of these"
 
 
+@pytest.mark.exhaustive
 def test_a_merged_set_is_trained_scored_and_exported(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
     words = (dataset.path, "--filters", "4,4,4", "--workers", "1", "--epochs", "3")
     small = (*words, "--split", "by-subject:2")

@@ -25,7 +25,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from support.fakes import rhythms
 
-pytestmark = pytest.mark.usefixtures("scikit_learn")
+pytestmark = [pytest.mark.usefixtures("scikit_learn"), pytest.mark.apart("models")]
 
 SAMPLES = 50
 
@@ -37,6 +37,7 @@ def fitted(name: str = "knn", features: str = "statistics", pca: Pca = False, se
 
 
 @pytest.mark.parametrize("name", list(BASELINES))
+@pytest.mark.exhaustive_for("extra-trees")
 def test_every_baseline_learns_gives_probabilities_and_repeats_itself(name: str) -> None:
     test = rhythms(30, seed=9)
     for features, pca in (("statistics", False), ("statistics", True), ("flattened", True)):

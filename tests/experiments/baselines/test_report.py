@@ -9,6 +9,8 @@ import pytest
 from plushsense.experiments.baselines.report import COUNTS, LEAKY, figure, milliseconds, page, program_table, size
 from plushsense.experiments.baselines.score import BaselinesResult, ProgramGap, ProgramScores, SplitFolds
 
+pytestmark = pytest.mark.apart("models")
+
 SPLITS = (("leave-one-subject-out", False), ("windows:5", True))
 
 

@@ -24,7 +24,7 @@ HERE = Path(__file__).parents[2]
 
 from support.fakes import LABELS, study
 
-pytestmark = pytest.mark.usefixtures("scikit_learn")
+pytestmark = [pytest.mark.usefixtures("scikit_learn"), pytest.mark.apart("models")]
 
 SPLITS = ("leave-one-subject-out", "windows:4")
 

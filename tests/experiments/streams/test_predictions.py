@@ -27,6 +27,8 @@ from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
 from plushsense.windows.features import Scaler
 
+pytestmark = pytest.mark.apart("models")
+
 DOCS = Path(__file__).parents[3] / "docs"
 REST, SLOW, FAST = GESTURES = (
     Gesture("Rest", "neutral", idle=True),

@@ -22,6 +22,8 @@ from plushsense.workflow.config import from_settings
 from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.preparation import outside_streams, prepare
 
+pytestmark = pytest.mark.apart("trainings")
+
 
 @pytest.fixture
 def rested(dataset: Dataset) -> Dataset:

@@ -13,6 +13,8 @@ from plushsense.experiments.sweep.run import sweep
 from plushsense.jobs.journal import JOURNAL
 from plushsense.jobs.progress import JobProgress
 
+pytestmark = pytest.mark.apart("cluster")
+
 GRID: dict[str, Any] = {
     "architectures": ("20d2_16d4_20d8", "19d1_24d3_19d9", "126d2", "1d1_27d3_20d9"),
     "filters": ((2, 2, 2, 2),),
@@ -36,6 +38,7 @@ class Killer:
             self.thread.start()
 
 
+@pytest.mark.exhaustive
 def test_a_node_lost_in_a_sweep_changes_nothing(two_nodes: Any, four_people: Path, tmp_path: Path) -> None:
     import polars
     from polars.testing import assert_frame_equal
@@ -55,6 +58,7 @@ def test_a_node_lost_in_a_sweep_changes_nothing(two_nodes: Any, four_people: Pat
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere.invalid:6379"])
+@pytest.mark.exhaustive_for("127.0.0.1:1", "nowhere.invalid:6379")
 def test_a_cluster_that_is_not_there(address: str, cluster_possible: None, four_people: Path, tmp_path: Path) -> None:
     from plushsense.core.errors import PlushSenseError
 

@@ -14,6 +14,8 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.sweep.run import SweepProgress, sweep
 
+pytestmark = pytest.mark.apart("cluster")
+
 if TYPE_CHECKING:
     import polars
 

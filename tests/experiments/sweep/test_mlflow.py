@@ -12,6 +12,8 @@ from plushsense.experiments.sweep.mlflow import TRIAL, export_trials
 from plushsense.experiments.sweep.results import read_sweep
 from support.made_sweep import make_sweep
 
+pytestmark = pytest.mark.apart("cluster")
+
 GRID = {"archs": ("250",), "filter_sets": ((4, 6, 8, 8),), "epochs": (5, 9), "batches": ("64", "full")}
 
 

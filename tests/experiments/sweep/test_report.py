@@ -24,6 +24,8 @@ from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS
 from plushsense.scoring.metrics import accuracy_complexity_ratio
 from support.made_sweep import make_sweep
 
+pytestmark = pytest.mark.apart("cluster")
+
 SMALL = {
     "archs": ("250", "14d1_39d2_41d4"),
     "filter_sets": ((4, 6, 8, 8), (8, 12, 16, 16)),
@@ -302,6 +304,7 @@ def test_the_page_is_complete_marked_and_beside_its_files(tmp_path):
     assert all((r["leaky"], r["simulated"], r["split"]) == ("yes", "yes", "windows:holdout") for r in rows)
 
 
+@pytest.mark.exhaustive
 def test_a_fair_split_of_real_data_bears_no_mark(tmp_path):
     case = {**SMALL, "split": "by-subject:5", "leaky": False, "folds": 5, "seeds": 2, "archs": ("250",)}
     page = write_report(make_sweep(tmp_path / "S", **case)).page.read_text(encoding="utf-8")
@@ -421,6 +424,7 @@ def test_a_trial_of_some_folds_is_neither_ranked_nor_averaged(tmp_path: Path) ->
     assert len(network.done) == 3 and network.mean() == pytest.approx(0.3)
 
 
+@pytest.mark.exhaustive
 def test_a_sweeps_folder_makes_its_page(cli: Any, tmp_path: Path) -> None:
     folder = make_sweep(tmp_path / "S", **ONE_TRIAL)
     done = cli("report", folder, "--json").json

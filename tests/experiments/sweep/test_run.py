@@ -26,6 +26,8 @@ from plushsense.jobs.journal import JOURNAL, UNFINISHED
 from plushsense.jobs.progress import JobProgress
 from plushsense.scoring.metrics import confusion
 
+pytestmark = pytest.mark.apart("cluster")
+
 if TYPE_CHECKING:
     import polars
 
@@ -390,6 +392,7 @@ def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset,
 
 
 @pytest.mark.parametrize("halving", [False, True])
+@pytest.mark.exhaustive_for("False", "True")
 def test_killed_and_gone_on_with(cli: Any, four_people: Path, tmp_path: Path, halving: bool) -> None:
     """Real recordings, ``kill -9`` at random moments: each training once, tables as of an undisturbed run."""
     from polars.testing import assert_frame_equal

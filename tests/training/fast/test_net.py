@@ -12,6 +12,8 @@ from plushsense.models.net import Net
 from plushsense.training.fast import plan
 from plushsense.training.fast.net import FastNet, can_train
 
+pytestmark = pytest.mark.apart("trainings")
+
 
 def pair(symbol: str, filters: str, padding: str, batch: int, window: int = 250, threads: int = 1, **more: int):  # type: ignore[no-untyped-def]
     arch = Arch.parse(symbol, filters, channels=5, classes=4, padding=padding, window=window, **more)
