@@ -89,7 +89,7 @@ def run_verify(args: argparse.Namespace) -> int:
         raise ConfigError("--subject chooses people of a data set: give --dataset too.")
     if args.samples is not None and args.samples < 1:
         raise ConfigError(f"--samples is {args.samples}: give 1 or more.")
-    for option in ("target", "faults", "trust") if args.device else ():
+    for option in ("target", "trust") if args.device else ():
         if getattr(args, option):
             message = f"--{option} is for programs that are compiled here: leave it out, or leave out --device."
             raise ConfigError(message)
@@ -106,8 +106,7 @@ def run_verify(args: argparse.Namespace) -> int:
     if args.device:
         done = verify_device(export, args.device, vectors, progress=progress)
     else:
-        mutants = (lambda mutant: True) if args.faults else None
-        done = verify(export, listed(*args.target), vectors, mutants=mutants, trust=args.trust, progress=progress)
+        done = verify(export, listed(*args.target), vectors, trust=args.trust, progress=progress)
     emit(args, {"export": args.export, **done.to_json()}, verification_lines(done))
     return 0 if done.passed else 1
 
@@ -127,25 +126,12 @@ def verification_lines(done: VerificationResult) -> list[str]:
         if r.cycles
     ]
     lines += [f"not run: {part} ({reason})" for part, reason in done.not_run]
-    if done.mutants:
-        targets = list(dict.fromkeys(m.target for m in done.mutants))
-        by_mutant: dict[tuple[str, str], dict[str, str]] = {}
-        for m in done.mutants:
-            by_mutant.setdefault((m.kind, m.name), {})[m.target] = (
-                "caught" if m.caught else "not shown" if m.silent else "NOT CAUGHT"
-            )
-        outcomes = [(*mutant, *(row.get(t, "") for t in targets)) for mutant, row in by_mutant.items()]
-        lines += ["", table(("kind", "mutant", *targets), outcomes)]
-        if any(m.silent for m in done.mutants):
-            lines += ["", "not shown: no test scenario of this network depends on that line of the rules."]
     if done.first:
         lines += ["", done.first]
     elif done.passed:
         lines += ["", "Every number of every answer is equal."]
-    elif not done.decisions:
-        lines += ["", "Nothing is proven: the toy was still warming up in all answers. Export the model again."]
     else:
-        lines += ["", "A mutant was not detected: the golden vectors of this export are too weak for it."]
+        lines += ["", "Nothing is proven: the toy was still warming up in all answers. Export the model again."]
     if done.own is None:
         lines += ["", "Which program the chip runs cannot be seen from here: it reports the model and its answers."]
     elif not done.own:

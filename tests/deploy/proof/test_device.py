@@ -292,6 +292,6 @@ def test_another_model_and_wrong_words(
     assert code == 2 and "carries no bytes both ways: accepted are serial:///dev/ttyUSB0 and tcp://host:port" in err
     code, _, err = verified(capsys, own, "serial:///dev/no-such-port")
     assert code == 2 and "no port" in err
-    for words in (["--target", "host"], ["--faults"], ["--trust"]):
+    for words in (["--target", "host"], ["--trust"]):
         assert main(["verify", str(own), "--device", "tcp://127.0.0.1:1", *words]) == 2
         assert "leave out --device" in capsys.readouterr().err

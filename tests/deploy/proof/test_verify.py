@@ -18,17 +18,15 @@ import pytest
 from plushsense.cli.export import verification_lines
 from plushsense.cli.main import main
 from plushsense.core.errors import BadInput, ConfigError, ToolError
-from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.deploy.golden import EVENT, FAULT, HEALTH, PATCH, TRACKING, answers_of, column
 from plushsense.deploy.package import ARDUINO, IDF, SKETCH
 from plushsense.deploy.profile import profile
-from plushsense.deploy.proof.mutants import RULES, Mutant, mutants_of, source_mutants
 from plushsense.deploy.proof.scenarios import scenarios_of
 from plushsense.deploy.proof.vectors import Export
-from plushsense.deploy.proof.verify import Setting, VerificationResult, verify
+from plushsense.deploy.proof.verify import Setting, verify
 from plushsense.deploy.quantize import integer_model
 from plushsense.deploy.targets import TARGETS
 from plushsense.runtime.decisions import DecideSpec
@@ -191,59 +189,6 @@ def test_the_same_on_every_chip(emulators: None, tmp_path: Path, name: str, monk
 # ---- It notices ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("each", ["kind", "all"])
-@pytest.mark.exhaustive_for("all")
-def test_every_fault_is_caught_on_the_host(
-    each: str, c_compiler: str, small: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    export = Export(small)
-    chosen: dict[str, str] = {}
-
-    def first_of_its_kind(mutant: Mutant) -> bool:
-        return chosen.setdefault(mutant.kind, mutant.name) == mutant.name
-
-    # A hundred mutants are compiled without optimisation, for which clang takes half as long as gcc.
-    quick = "clang" if shutil.which("clang") else c_compiler
-    wanted = first_of_its_kind if each == "kind" else lambda mutant: True
-    done = verify(export, ["host"], only=lambda s: (s.cc, s.options) == (quick, "-O0"), mutants=wanted)
-    assert [f.name for f in done.mutants if not f.caught] == [] and done.passed
-    kinds = {"weight", "shift", "index", "rounding", "clamp", "rule", "constant", "patch", *RULES}
-    assert {f.kind for f in done.mutants} == kinds
-    every = len([m for m in source_mutants() if m.when != "vectors"]) + 10
-    assert len(done.mutants) == (len(kinds) if each == "kind" else every)
-    # By an answer, not because the toy would not begin or crashed.
-    assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.mutants)
-
-
-@pytest.mark.exhaustive
-def test_every_fault_of_a_vector_layer_is_caught(c_compiler: str, tmp_path: Path) -> None:
-    export = Export(exported(tmp_path / "out", bundle_of("accel-3", "v14_19d2", "4,8")))
-    names = {"one weight of the vector layer by one", *(m.name for m in source_mutants() if m.when == "vectors")}
-    done = verify(export, ["host"], only=plainly, mutants=lambda mutant: mutant.name in names)
-    assert {f.name for f in done.mutants if f.caught} == names and done.passed
-
-
-@pytest.mark.exhaustive
-def test_a_fault_of_the_rules_that_no_scenario_shows_is_no_defect_of_the_c(
-    c_compiler: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two classes, one of them idle in the scenarios: a mutant needs more scenarios, or is reported as not shown."""
-    two = GestureSet("two", (Gesture("pat", "positive"), Gesture("rest", "none")))
-    export = Export(exported(tmp_path / "out", bundle_of("accel-3", gestures=two, seed=5)))
-    seldom = "an affect stays at the share at which it begins"
-
-    def result() -> VerificationResult:
-        names = {seldom, "an event begins a step too soon"}
-        return verify(export, ["host"], only=plainly, mutants=lambda mutant: mutant.name in names)
-
-    assert all(f.caught for f in result().mutants)
-    monkeypatch.setattr("plushsense.deploy.proof.verify.MORE_SCENARIOS", 0)
-    done = result()
-    assert [f.name for f in done.mutants if not f.caught] == [seldom] == [f.name for f in done.mutants if f.silent]
-    assert done.passed and done.to_json()["passed"]
-    assert "not shown: no test scenario of this network" in "\n".join(verification_lines(done))
-
-
 def test_scenarios_have_sensors_that_are_stuck_where_they_may_be(small: Path) -> None:
     """Also where six spreads are wider than the valid range, as of a lively accelerometer."""
     export = Export(small)
@@ -255,34 +200,14 @@ def test_scenarios_have_sensors_that_are_stuck_where_they_may_be(small: Path) ->
         assert "fault" in outcomes_of(scenario)
 
 
-@pytest.mark.parametrize(
-    ("target", "second"),
-    list(zip(EMULATED, ("shift", "index", "rounding", "index", "clamp"), strict=True)),
-    ids=EMULATED,
-)
-@pytest.mark.exhaustive_for("cortex-m0", "cortex-m33", "cortex-m4", "riscv32")
-def test_faults_are_caught_on_every_chip(emulators: None, small: Path, target: str, second: str) -> None:
-    """A weight on each of them, and another kind of fault: on the host each kind is caught."""
-    chosen = {"one weight of layer 1 by one", "one shift of layer 2 by one"}
-    chosen |= {next(m.name for m in source_mutants() if m.kind == kind) for kind in ("index", "rounding", "clamp")}
-    kinds = ["weight", second]
-    done = verify(Export(small), [target], only=plainly, mutants=lambda m: m.name in chosen and m.kind in kinds)
-    assert [(f.kind, f.target, f.caught) for f in done.mutants] == [(kind, target, True) for kind in kinds]
-    assert done.passed
-
-
-def test_golden_vectors_that_are_too_weak_let_a_fault_through(
-    c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_golden_vectors_in_which_the_toy_only_warms_up_prove_nothing(c_compiler: str, own: Path) -> None:
     golden = Export(own).golden
-    few = golden.answers[golden.answers[:, 1] < 40]
-    assert len(few)
     (own / "golden" / "frames.bin").write_bytes(golden.frames[:40].astype("<u4").tobytes())
+    few = golden.answers[golden.answers[:, 1] < 40]
     (own / "golden" / "answers.bin").write_bytes(few.astype("<i4").tobytes())
-    done = verify(Export(own), ["host"], only=plainly, mutants=lambda mutant: mutant.kind in ("weight", "constant"))
-    assert done.mismatches == 0 and not done.passed
-    assert done.decisions == 0 and not verify(Export(own), ["host"], only=plainly).passed, "the toy only warmed"
-    assert not any(f.caught for f in done.mutants if f.kind == "weight")
+    done = verify(Export(own), ["host"], only=plainly)
+    assert len(few) and (done.mismatches, done.decisions, done.passed) == (0, 0, False)
+    assert "Nothing is proven" in "\n".join(verification_lines(done))
 
 
 def test_a_file_edited_by_hand_is_what_is_tested(
@@ -382,22 +307,7 @@ def test_an_image_that_was_edited(c_compiler: str, own: Path) -> None:
     assert [r.flags for r in bad] == ["-O2 plush_model.bin"]
     assert bad[0].mismatches == bad[0].vectors and "PLUSH_DAMAGED" in (bad[0].first or "")
     with pytest.raises(BadInput, match="is not what this PlushSense makes of model.plush"):
-        verify(Export(own), ["host"], mutants=lambda mutant: True, trust=True)
-    with pytest.raises(BadInput, match="is not what this PlushSense makes of model.plush"):
         Export(own).made_up(10)
-
-
-@pytest.mark.exhaustive
-def test_without_smoothing_no_mutant_is_applied_that_cannot_show(c_compiler: str, tmp_path: Path) -> None:
-    """Nor one that the toy would only refuse. Those of the rules show in scenarios, which have models of their own."""
-    bundle = replace(bundle_of("plush-15", "9d1_5d2", "4,6"), decision={"smoothing_s": 0})
-    export = Export(exported(tmp_path / "out", bundle))
-    applied = mutants_of(export.image, export.source.decode("latin-1"))
-    assert len(applied) == len([m for m in source_mutants() if m.when != "vectors"]) + 9
-    numbers = ("rounding", "clamp", "constant", "shift")  # the other kinds do not meet the smoothing
-    done = verify(export, ["host"], only=plainly, mutants=lambda mutant: mutant.kind in numbers)
-    assert done.passed and len(done.mutants) == sum(mutant.kind in numbers for mutant in applied)
-    assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.mutants)
 
 
 def test_an_edited_model_that_agrees_with_its_golden_vectors_is_not_vouched_for(

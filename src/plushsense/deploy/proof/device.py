@@ -151,7 +151,7 @@ def verify_device(
         _cycles(chip, measured, fitting),
     )
     decisions = sum(v.decisions for v in fitting if v not in scenarios)
-    return VerificationResult(export.title, export.edited, decisions, counted(fitting), (run,), tuple(not_run), ())
+    return VerificationResult(export.title, export.edited, decisions, counted(fitting), (run,), tuple(not_run))
 
 
 def _greet(packets: _PacketLink, export: Export) -> _DeviceInfo:

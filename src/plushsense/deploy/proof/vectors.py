@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -126,9 +127,7 @@ class Export:
         compiled = {prefixed(file, name) for file in files} & set(self.changed)
         self._files = {f: c if f == IMAGE else without_prefix(c, name) for f, c in files.items()} if name else None
         self._compiles_changed = bool(compiled)
-        self.image, self.source = files[IMAGE], without_prefix(files[LIBRARY[1]], name)
-        self._scenarios: dict[int, list[Vectors]] = {}
-        self._patched: Vectors | None = None
+        self.image = files[IMAGE]
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)
         self.golden = Vectors("golden", frames, answers, self._samples(frames))
@@ -177,11 +176,6 @@ class Export:
                 bundle=BUNDLE,
             )
 
-    @property
-    def code_names(self) -> tuple[str, ...]:
-        """Names of the files that a program is compiled from, without the name of the export."""
-        return tuple(self._code)
-
     def code(self, room: Path) -> Path:
         """Return the folder to compile from: the new folder ``room``, or the export itself if its C was changed and it
         has no name.
@@ -208,36 +202,33 @@ class Export:
         return samples_of(frames, self.model.layout)
 
     def answered(self, name: str, frames: Ints) -> Vectors:
-        """Compute the expected answers to frames; raise BadInput like `require_own`."""
-        self.require_own()
-        return Vectors(name, frames, answers_of(self.model, frames), self._samples(frames))
+        """Compute the expected answers to frames.
 
-    def require_own(self) -> None:
-        """Raise BadInput if plush_model.bin differs from what this version makes of the bundle."""
+        Raises:
+            BadInput: if plush_model.bin differs from what this version makes of the bundle.
+        """
         if not self.is_own:
             raise BadInput(
                 f"{IMAGE} in '{self.folder}' is not what this PlushSense makes of {BUNDLE} beside it, so that only the "
                 "golden vectors can be checked: export the model again."
             )
+        return Vectors(name, frames, answers_of(self.model, frames), self._samples(frames))
 
-    def scenarios(self, repeat: int = 0) -> list[Vectors]:
-        """Return the test scenarios for the export's network, different for each ``repeat``.
-
-        Empty if plush_model.bin differs from what this version makes of the bundle.
-        """
-        if not self.is_own:
-            return []
-        if repeat not in self._scenarios:
-            self._scenarios[repeat] = scenarios_of(self.model, self.bundle.scaler, repeat)
-        return self._scenarios[repeat]
+    def scenarios(self) -> list[Vectors]:
+        """Return the test scenarios for the export's network; empty if plush_model.bin is not this version's."""
+        return self._scenarios if self.is_own else []
 
     def patched(self) -> list[Vectors]:
         """Return frames between which patches of the last layer are offered; empty if plush_model.bin differs."""
-        if not self.is_own:
-            return []
-        if self._patched is None:
-            self._patched = patches_of(self.model, self.bundle.scaler)
-        return [self._patched]
+        return [self._patched] if self.is_own else []
+
+    @cached_property
+    def _scenarios(self) -> list[Vectors]:
+        return scenarios_of(self.model, self.bundle.scaler)
+
+    @cached_property
+    def _patched(self) -> Vectors:
+        return patches_of(self.model, self.bundle.scaler)
 
     def made_up(self, samples: int) -> list[Vectors]:
         """Generate further frames like the golden ones, for at least ``samples`` samples."""

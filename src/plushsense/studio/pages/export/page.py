@@ -56,8 +56,6 @@ _HEADS: Texts = {
     "stream": "Input",
     "samples": "Samples",
     "frames": "Frames",
-    "fault_kind": "Where",
-    "fault": "Fault",
     "chip": "Chip",
     "mhz": "MHz",
     "estimate": "ms per step, estimated",
@@ -72,12 +70,6 @@ _HEADS: Texts = {
     "data": "Data",
     "made": "Created",
     "last_proof": "Last verification",
-}
-
-_OUTCOMES: Texts = {
-    "caught": "detected",
-    "not_shown": "cannot be detected",
-    "not_caught": "NOT detected",
 }
 
 _STAGES: Texts = {
@@ -292,10 +284,6 @@ class VerificationCard:
                 self._dataset = ui.select(options, value="", label=words("Also stream the recordings of")).classes(
                     "w-full"
                 )
-                self._faults = tag(
-                    ui.checkbox(words("Also insert faults, one at a time; each must be detected (takes minutes)")),
-                    "faults",
-                )
                 self._trust = tag(
                     ui.checkbox(
                         words(
@@ -329,7 +317,6 @@ class VerificationCard:
                 "place": str(self.export.folder),
                 "targets": chosen,
                 "dataset": dataset,
-                "faults": bool(self._faults.value),
                 "trust": bool(self._trust.value),
             }
             await self.work.start("verify", spec)
@@ -386,8 +373,6 @@ class VerificationCard:
                     words("Not run: {what} ({why}).", what=each["what"], why=words.sentence(each["why"])),
                     classes="ps-dim",
                 )
-            if result["faults"]:
-                self._mutants(result["faults"])
 
     def _sum(self, result: dict[str, Any]) -> str:
         total, unequal = self.words.count(result["vectors"]), self.words.count(result["mismatches"])
@@ -409,10 +394,6 @@ class VerificationCard:
             sentences.append(
                 words("Nothing is verified: in no answer had the toy finished warming up. Export the network again.")
             )
-        elif not result["passed"]:
-            sentences.append(
-                words("An inserted fault was not detected: the golden vectors of this export are too weak for it.")
-            )
         if not result["own"]:
             sentences.append(
                 words(
@@ -424,23 +405,6 @@ class VerificationCard:
                 words("These files are not what PlushSense writes: {files}", files=", ".join(result["changed"]))
             )
         return sentences
-
-    def _mutants(self, faults: Sequence[dict[str, Any]]) -> None:
-        words = self.words
-        kinds = {True: "caught", None: "not_shown", False: "not_caught"}
-        rows = []
-        for each in faults:
-            state = True if each["caught"] else None if each["silent"] else False
-            cell = verdict(state, words(_OUTCOMES[kinds[state]]))
-            rows.append((each["kind"], each["fault"], self._title(each["target"]), cell))
-        with ui.expansion(words("{n} inserted faults", n=len(rows))).classes("w-full"):
-            head = [words(_HEADS[k]) for k in ("fault_kind", "fault", "target", "verdict")]
-            table(words("Inserted faults, one at a time"), head, rows)
-            if any(f["silent"] for f in faults):
-                text(
-                    words("Cannot be detected: no test scenario of this network depends on that line of the rules."),
-                    classes="ps-dim",
-                )
 
 
 _TASKS = ("export", "profile", "verify")
