@@ -30,7 +30,7 @@ from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import ToySpec, ToyStream, VirtualDevice
 from plushsense.devices.wire import LineParser
-from plushsense.live.loop import run_many
+from plushsense.live.loop import percentiles_ms, run_live
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
@@ -91,10 +91,27 @@ def many(bundle: Bundle, toys: int, seconds: float) -> dict[str, Any]:
         device.play_ahead()
     gc.collect()
     gc.freeze()  # existing objects live on; scanning them at every collection would take tens of ms
-    live = run_many([(device, StreamClassifier(bundle)) for device in devices])
-    for _ in live:
-        pass
-    return live.summary().to_dict()
+    running = runs = [run_live(device, StreamClassifier(bundle)) for device in devices]
+    began, worked = time.perf_counter(), time.process_time()
+    while running:
+        before = sum(device.counters.frames for device in devices)
+        for one in running:
+            one.device.wait_s = 0.0
+            one.poll()
+        running = [one for one in running if not one.over]
+        if sum(device.counters.frames for device in devices) == before:
+            time.sleep(0.001)
+    wall, cpu = time.perf_counter() - began, time.process_time() - worked
+    latencies = [latency for one in runs for latency in one.latencies_s]
+    return {
+        "toys": toys,
+        "decisions": sum(one.summary().decisions for one in runs),
+        "late": sum(one.summary().late for one in runs),
+        "wall_s": round(wall, 3),
+        "cpu_s": round(cpu, 3),
+        "latency_ms": percentiles_ms(latencies) | {"max": round(1000 * max(latencies), 3)},
+        "busy": round(cpu / wall, 4),
+    }
 
 
 def main() -> None:

@@ -51,10 +51,6 @@ NOT_RUN = {
     "make ": ("CI runs the targets", ""),
     ".venv/bin/python -m pytest": ("it runs tests", ""),
     "python bench/": ("minutes to hours on real recordings; the options are those of the program", ""),
-    "plushsense verify OUT --faults": (
-        "it compiles C for each of many mutants",
-        "tests/deploy/proof/test_verify.py::test_every_fault_is_caught_on_the_host",
-    ),
     "plushsense verify OUT --device": (
         "a chip on a serial port",
         "tests/deploy/proof/test_device.py::test_a_chip_of_qemu_answers_over_its_uart",

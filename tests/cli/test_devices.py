@@ -79,17 +79,6 @@ def test_refusals(cli: Any, words: list[str], said: str) -> None:
 
 
 @pytest.mark.usefixtures("lsl_possible")
-def test_a_virtual_toy_on_lsl_is_read_live(plush_bundle: Path) -> None:
-    name = f"toy {uuid.uuid4().hex[:8]}"
-    with beside("toy", "--lsl", name, "--speed", "5", "--lost", "0", "--garbled", "0") as url:
-        summary = live("--device", url, "--model", str(plush_bundle), "--seconds", "5")
-    assert summary["seconds"] == pytest.approx(5, abs=0.1)
-    assert summary["counters"] | {"frames": 0, "garbage": 0} == {
-        "frames": 0, "lost": 0, "malformed": 0, "garbage": 0, "reconnects": 0,
-    }  # fmt: skip
-
-
-@pytest.mark.usefixtures("lsl_possible")
 def test_a_toy_handed_on_to_lsl_goes_away_and_comes_back(plush_bundle: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -16,11 +16,9 @@ from tests.support.sent_lines import NAMED, toy_of_lines
 from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError
 from plushsense.core.layouts import Channel, CsvFormat, Layout, load_layout
 from plushsense.devices.base import Device, Frame
-from plushsense.devices.lsl import LslDevice, LslOutlet, forward, load_pylsl, name_url, serve_lsl
+from plushsense.devices.lsl import LslOutlet, forward, load_pylsl, name_url
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
-from plushsense.devices.virtual.server import ToyServer
-from plushsense.devices.virtual.stream import ToySpec
 
 PLUSH = load_layout("plush-15")
 PHONE = load_layout("phone-6")
@@ -267,33 +265,6 @@ def test_closing_from_another_thread_ends_the_frames(name: str) -> None:
 
 
 @needs_lsl
-def test_the_virtual_toy_on_lsl_says_what_the_virtual_toy_says(name: str) -> None:
-    spec = ToySpec(person=7, lost=0.0, garbled=0.0)
-    ready, stop, urls, performed = threading.Event(), threading.Event(), [], []
-
-    def on_ready(url: str) -> None:
-        urls.append(url)
-        ready.set()
-
-    server = ToyServer(spec, speed=20, on_ready=on_ready, on_performed=performed.append, stop=stop)
-    thread = threading.Thread(target=serve_lsl, args=(name, server), daemon=True)
-    thread.start()
-    try:
-        assert ready.wait(5)
-        with open_device(urls[0]) as device:
-            assert isinstance(device, LslDevice)
-            got = take(device, 1500)
-            assert device.counters.lost == device.counters.malformed == 0
-    finally:
-        stop.set()
-        thread.join(5)
-    with open_device("virtual://?person=7&lost=0&garbled=0&speed=0") as same:
-        truth = {f.device_ms: f.values for f, _ in zip(same, range(60_000), strict=False)}
-    assert all(truth[f.device_ms] == f.values for f in got)
-    assert performed and not thread.is_alive()
-
-
-@needs_lsl
 def test_forward_wants_the_same_channels(name: str) -> None:
     with (
         open_device("virtual://?speed=0&seconds=1") as device,
@@ -315,8 +286,6 @@ def test_forward_warns_of_lines_that_cannot_be_read(name: str) -> None:
 def test_an_outlet_needs_a_name() -> None:
     with pytest.raises(ConfigError, match="needs a name"):
         LslOutlet(WIDE, " ")
-    with pytest.raises(ConfigError, match="must be above 0"):
-        serve_lsl("x", ToyServer(speed=0))
 
 
 def test_without_pylsl(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -95,22 +95,14 @@ def run_toy(args: argparse.Namespace) -> int:
         prompts=LogPrompts(args.follow) if args.follow else None,
     )
     try:
-        if args.lsl is not None:
-            from plushsense.devices.lsl import serve_lsl
-
-            counters = serve_lsl(args.lsl, server)
-        else:
-            counters = server.serve_pty() if args.serial_pty else server.serve_tcp(args.tcp)
+        counters = server.serve_pty() if args.serial_pty else server.serve_tcp(args.tcp)
     except KeyboardInterrupt:
         say("stopped")
         return 0
     finally:
         if truth is not None:
             truth.close()
-    if args.lsl is not None:
-        say(f"published {plural(counters.sent, 'frame')}")  # LSL does not report who received them
-    else:
-        say(f"sent {plural(counters.sent, 'line')}; {counters.dropped} had no reader")
+    say(f"sent {plural(counters.sent, 'line')}; {counters.dropped} had no reader")
     return 0
 
 

@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             pass
         finally:
-            both = {"agreement": classifier.agreement()} if isinstance(classifier, BothEngines) else {}
+            both = {"agreement": vars(classifier.agreement())} if isinstance(classifier, BothEngines) else {}
             say(json.dumps(live.summary().to_dict() | both))
     return 0
 

@@ -19,9 +19,6 @@ from plushsense.core.layouts import DEVICE_MS, Layout
 from plushsense.core.sentences import Message
 from plushsense.devices.base import Device, Frame, LossCounter, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
-from plushsense.devices.reconnect import ReconnectingDevice
-from plushsense.devices.virtual.server import ToyCounters, ToyServer
-from plushsense.devices.virtual.stream import PerformedGesture, VirtualDevice
 
 FIND_S = 5.0
 KEYS = {"name": "name", "type": "type", "source": "source_id", "uid": "uid"}
@@ -391,30 +388,3 @@ def forward(
         if stop is not None and stop.is_set():
             break
     return count
-
-
-def serve_lsl(name: str, server: ToyServer) -> ToyCounters:
-    """Publish the virtual toy as an LSL stream until ``server.stop`` is set.
-
-    Lines that the toy loses or corrupts are missing from the stream.
-
-    Raises:
-        ConfigError: for a speed of 0, since no reader of an LSL stream limits its speed.
-    """
-    if not server.speed > 0.0:
-        raise ConfigError(f"The toy's speed on LSL is {server.speed:g}; it must be above 0.")
-    counters = ToyCounters()
-
-    def begun(gesture: PerformedGesture) -> None:
-        counters.gestures += 1
-        server.on_performed(gesture)
-
-    toy = VirtualDevice("virtual://", server.layout, server.spec, server.speed, server.seconds)
-    toy.on_performed = begun
-    if server.prompts is not None:
-        toy.follow(server.prompts)
-    device = ReconnectingDevice("virtual://", server.layout, lambda: toy, ends=True)
-    with device, LslOutlet(toy.layout, name) as outlet:
-        server.on_ready(outlet.url)
-        counters.sent = forward(device, outlet, server.stop)
-    return counters

@@ -21,15 +21,15 @@ from typing import Any, Self
 
 from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import STREAM_NAME
+from plushsense.core.recorder_csv import STREAM_NAME, Frames
 from plushsense.core.sentences import Message
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.session import OpenSession
-from plushsense.recording.session_files import SessionEvent, SessionHead
+from plushsense.recording.session_files import FORMAT_VERSION, SessionEvent, SessionHead
 from plushsense.recording.status import PlanProgress, RecorderState, RecorderStatus, StepResult, key_of
-from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, StreamGap, sidecar
+from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, StreamGap, measured_rate_hz
 from plushsense.recording.writer import BackgroundWriter, StreamFile, lacks_descriptor, save_take, to_frames
 
 _NO_DESCRIPTOR = Message(
@@ -640,7 +640,7 @@ def store_take(
     """
     layout, step = session.layout, take.step
     frames = to_frames(take.frames, layout.n_channels)
-    metadata = sidecar(take, frames, layout, session.head, counters, ended, saved_ms=saved_ms, **more)
+    metadata = _sidecar(take, frames, layout, session.head, counters, ended, saved_ms=saved_ms, **more)
     path = save_take(session.folder, frames, layout, step.gesture, saved_ms, metadata)
     key = {"gesture": step.gesture, "repetition": step.repetition}
     result = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": ended}
@@ -659,6 +659,47 @@ def store_take(
         else:
             message = Message("This recording has a jump in the toy's clock; it is kept, r records it again.")
     return path.name, message
+
+
+def _sidecar(
+    take: RecordingTake,
+    frames: Frames,
+    layout: Layout,
+    head: SessionHead,
+    counters: Counters,
+    ended: Ended,
+    **more: Any,
+) -> dict[str, Any]:
+    """Return the metadata of a recording for its sidecar: subject, gesture, clocks, device, transmission faults."""
+    assert frames.host_ms is not None
+    outside = (frames.values < layout.valid_min_int) | (frames.values > layout.valid_max_int)
+    step = take.step
+    return {
+        "format": FORMAT_VERSION,
+        "subject": head.subject,
+        "session": head.session,
+        "gesture": step.gesture,
+        "repetition": step.repetition,
+        "prompt": step.prompt,
+        "protocol": head.protocol["name"],
+        "words": head.protocol["words"],
+        "rows": len(frames),
+        "stream_row": take.row,
+        "device_ms": [int(frames.device_ms[0]), int(frames.device_ms[-1])],
+        "host_ms": [int(frames.host_ms[0]), int(frames.host_ms[-1])],
+        "rate_hz": round(measured_rate_hz(frames.device_ms), 2),
+        "lost": take.lost,
+        "malformed": counters.malformed - take.before.malformed,
+        "garbage": int(outside.any(axis=1).sum()),
+        "reconnects": counters.reconnects - take.before.reconnects,
+        "gaps": [gap.to_json() for gap in take.gaps],
+        "ended": ended,
+        "auto_stopped": ended == "longest",
+        "layout": layout.name,
+        "wire": list(layout.wire),
+        "device": head.device,
+        "simulated": head.simulated,
+    } | more
 
 
 _FILES_OPEN = (

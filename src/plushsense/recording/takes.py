@@ -11,10 +11,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames
 from plushsense.devices.base import Counters, Device, Frame, LossCounter, now_ms
 from plushsense.recording.plan import Step
-from plushsense.recording.session_files import FORMAT_VERSION, SessionHead
 
 SPAN_MS = 2_000
 LOSS_SPAN_MS = 10_000
@@ -148,47 +146,6 @@ def duration_s(rows: int, rate_hz: float) -> float:
     of more than a second and resets do not.
     """
     return rows / rate_hz if rate_hz > 0 else 0.0
-
-
-def sidecar(
-    take: RecordingTake,
-    frames: Frames,
-    layout: Layout,
-    head: SessionHead,
-    counters: Counters,
-    ended: Ended,
-    **more: Any,
-) -> dict[str, Any]:
-    """Return the metadata of a recording for its sidecar: subject, gesture, clocks, device, transmission faults."""
-    assert frames.host_ms is not None
-    outside = (frames.values < layout.valid_min_int) | (frames.values > layout.valid_max_int)
-    step = take.step
-    return {
-        "format": FORMAT_VERSION,
-        "subject": head.subject,
-        "session": head.session,
-        "gesture": step.gesture,
-        "repetition": step.repetition,
-        "prompt": step.prompt,
-        "protocol": head.protocol["name"],
-        "words": head.protocol["words"],
-        "rows": len(frames),
-        "stream_row": take.row,
-        "device_ms": [int(frames.device_ms[0]), int(frames.device_ms[-1])],
-        "host_ms": [int(frames.host_ms[0]), int(frames.host_ms[-1])],
-        "rate_hz": round(measured_rate_hz(frames.device_ms), 2),
-        "lost": take.lost,
-        "malformed": counters.malformed - take.before.malformed,
-        "garbage": int(outside.any(axis=1).sum()),
-        "reconnects": counters.reconnects - take.before.reconnects,
-        "gaps": [gap.to_json() for gap in take.gaps],
-        "ended": ended,
-        "auto_stopped": ended == "longest",
-        "layout": layout.name,
-        "wire": list(layout.wire),
-        "device": head.device,
-        "simulated": head.simulated,
-    } | more
 
 
 AWAY_S = 1.0

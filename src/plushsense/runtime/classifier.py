@@ -254,6 +254,20 @@ class IntegerClassifier(StreamReader):
         super().__init__(model.network.stepper(), model.layout, model.gestures, model.rules, model.smoothing)
 
 
+@dataclass(frozen=True)
+class EngineAgreement:
+    """Agreement of two networks on one stream.
+
+    ``decisions`` counts those with an answer; ``gesture`` and ``affect`` are the shares of equal ones;
+    ``largest_difference`` is that of smoothed probabilities. None without answers, or without affects.
+    """
+
+    decisions: int
+    gesture: float | None
+    affect: float | None
+    largest_difference: float | None
+
+
 class BothEngines(IntegerClassifier):
     """Classifies like the deployed model, and counts differences from its float original on the same frames."""
 
@@ -290,19 +304,11 @@ class BothEngines(IntegerClassifier):
             self._largest = max(self._largest, *(abs(a - b) for a, b in zip(shares, other_shares, strict=True)))
         return decisions
 
-    def agreement(self) -> dict[str, Any]:
-        """Return how often both networks gave the same answer.
-
-        ``decisions`` counts those with an answer; ``gesture`` and ``affect`` are the shares of equal ones;
-        ``largest_difference`` is that of smoothed probabilities. None without answers, or without affects.
-        """
+    def agreement(self) -> EngineAgreement:
+        """Return how often both networks gave the same answer."""
         n = self._compared
-        return {
-            "decisions": n,
-            "gesture": self._gesture / n if n else None,
-            "affect": self._affect / n if n and self._has_affects else None,
-            "largest_difference": self._largest if n else None,
-        }
+        affect = self._affect / n if n and self._has_affects else None
+        return EngineAgreement(n, self._gesture / n if n else None, affect, self._largest if n else None)
 
 
 def whole_frame(frame: Frame, layout: Layout) -> Frame:

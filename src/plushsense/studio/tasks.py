@@ -474,7 +474,8 @@ _SAMPLES = 100_000
 def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Verify the export ``place`` on ``targets``, by default on all that are available.
 
-    The input is recordings of ``dataset`` if given, else generated data. With ``trust``, also verify a folder with code that PlushSense does not write.
+    The input is recordings of ``dataset`` if given, else generated data. With ``trust``, also verify a folder with code
+    that PlushSense does not write.
     """
     folder = Path(spec["place"])
     digest = folder_digest(folder)

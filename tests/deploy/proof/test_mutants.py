@@ -85,7 +85,9 @@ def test_without_smoothing_no_mutant_is_made_that_cannot_show(c_compiler: str, t
 
 
 @pytest.mark.parametrize(
-    ("target", "second"), list(zip(EMULATED, ("shift", "index", "rounding", "index", "clamp"), strict=True)), ids=EMULATED
+    ("target", "second"),
+    list(zip(EMULATED, ("shift", "index", "rounding", "index", "clamp"), strict=True)),
+    ids=EMULATED,
 )
 @pytest.mark.exhaustive_for("cortex-m0", "cortex-m33", "cortex-m4", "riscv32")
 def test_mutants_are_found_on_every_chip(

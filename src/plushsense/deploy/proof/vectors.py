@@ -21,7 +21,6 @@ from plushsense.deploy.code import (
     FACTS,
     GOLDEN,
     IMAGE,
-    LIBRARY,
     MOST_FILE_BYTES,
     check_names,
     code_files,
