@@ -45,7 +45,7 @@ from plushsense.live.loop import run_live
 from plushsense.models.bundle import Bundle
 from plushsense.recording.plan import save_protocol
 from plushsense.recording.recorder import AutoRecording, Recorder
-from plushsense.recording.request import SessionRequest, session_head
+from plushsense.recording.session import SessionRequest, session_head
 from plushsense.runtime.classifier import StreamClassifier
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE

@@ -14,7 +14,7 @@ from opponents.tables import OUR_ROW, PLAIN_ROW, WHOLE_ROW
 
 from plushsense.deploy import profile
 from plushsense.deploy.code import read_facts
-from plushsense.deploy.emit import emit
+from plushsense.deploy.package import emit
 from plushsense.deploy.targets import build
 
 HERE = Path(__file__).resolve().parent

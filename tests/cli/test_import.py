@@ -11,7 +11,7 @@ import pytest
 
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.writer import SessionHead
 from support.foreign_folders import FOLDERS
 
 ACCEL = load_layout("accel-3")

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from plushsense.recording.session_files import SessionHead, read_events
+from plushsense.recording.writer import SessionHead, read_events
 
 Cli = Callable[..., Any]
 COMMAND = [sys.executable, "-m", "plushsense", "record"]

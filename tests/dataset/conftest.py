@@ -15,7 +15,7 @@ import pytest
 
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
-from plushsense.recording.session_files import SESSION_LOG, SIDECAR, SessionEvent, SessionHead
+from plushsense.recording.writer import SESSION_LOG, SIDECAR, SessionEvent, SessionHead
 from support.requirements import missing
 
 START_MS = 1_760_000_000_000

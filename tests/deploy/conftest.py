@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from plushsense.dataset.importing.importers import import_recordings
-from plushsense.deploy.emit import emit
+from plushsense.deploy.package import emit
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel
 from support.c_toy import C_FOLDER, TOY_C, compiled

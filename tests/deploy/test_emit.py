@@ -15,8 +15,8 @@ from plushsense.core.errors import BadInput
 from plushsense.core.gestures import GestureSet
 from plushsense.core.templates import c_comment
 from plushsense.deploy.code import TOY_BYTES, c_names, read_facts
-from plushsense.deploy.emit import emit
 from plushsense.deploy.golden import answers_of, column, golden_frames, read_golden
+from plushsense.deploy.package import emit
 from plushsense.deploy.quantize import integer_model
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import IntegerModel, memory_bytes
@@ -67,7 +67,7 @@ def test_a_folder_that_cannot_be_finished_leaves_nothing(tmp_path: Path, monkeyp
     def fail(*_: object) -> None:
         raise OSError("no more")
 
-    monkeypatch.setattr("plushsense.deploy.emit.write_golden", fail)
+    monkeypatch.setattr("plushsense.deploy.package.write_golden", fail)
     with pytest.raises(BadInput, match="no more"):
         emit(*made(), tmp_path / "out")
     assert not list(tmp_path.iterdir())

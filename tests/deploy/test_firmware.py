@@ -17,7 +17,6 @@ from plushsense.core.errors import LayoutError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Channel, Layout, load_layout
 from plushsense.deploy.code import facts_of
-from plushsense.deploy.emit import emit
 from plushsense.deploy.golden import answers_of, column, read_golden
 from plushsense.deploy.package import (
     ARDUINO,
@@ -25,6 +24,7 @@ from plushsense.deploy.package import (
     IDF,
     IDF_TASKS,
     SKETCH,
+    emit,
     firmware,
 )
 from plushsense.deploy.quantize import integer_model

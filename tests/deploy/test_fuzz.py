@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.layouts import load_layout
-from plushsense.deploy.emit import emit
-from plushsense.deploy.package import ARDUINO
+from plushsense.deploy.package import ARDUINO, emit
 from plushsense.deploy.proof.scenarios import patches_of
 from plushsense.deploy.quantize import integer_model
 from support.c_toy import C_FOLDER

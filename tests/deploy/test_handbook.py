@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from plushsense.deploy.code import read_facts
-from plushsense.deploy.emit import emit
-from plushsense.deploy.package import ARDUINO
+from plushsense.deploy.package import ARDUINO, emit
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel
 from support.exports import bundle_of

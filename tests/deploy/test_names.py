@@ -13,8 +13,8 @@ import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.deploy.code import BUNDLE, code_files, prefixed, read_facts, without_prefix
-from plushsense.deploy.emit import emit
 from plushsense.deploy.golden import ANSWER, read_golden
+from plushsense.deploy.package import emit
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.quantize import integer_model
 from support.exports import bundle_of

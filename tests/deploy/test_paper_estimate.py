@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from plushsense.deploy.paper_estimate import compare_with_paper
+from plushsense.deploy.profile import compare_with_paper
 from plushsense.models.arch import Arch
 
 MINE = Arch.parse("9d1_5d2", "4,6", channels=3, classes=4)

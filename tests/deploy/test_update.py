@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from plushsense.deploy.emit import emit
-from plushsense.deploy.package import TWO_SLOTS
+from plushsense.deploy.package import TWO_SLOTS, emit
 from plushsense.deploy.quantize import integer_model
 from support.exports import bundle_of
 from support.virtual_boards import run

@@ -17,9 +17,9 @@ import pytest
 from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError
 from plushsense.core.layouts import load_layout
 from plushsense.devices import ble
+from plushsense.devices.base import ReconnectingDevice
 from plushsense.devices.ble import UART_SERVICE, UART_TX, BleBackends, BleDevice, BleTarget
 from plushsense.devices.opening import list_devices, open_device, parse_url
-from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.faults import Fault
 from plushsense.devices.virtual.scenario import ScenarioPart, ToyScenario
 from plushsense.devices.virtual.stream import ToySpec, ToyStream, received

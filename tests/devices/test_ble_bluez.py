@@ -16,9 +16,8 @@ import pytest
 
 from plushsense.core.errors import DeviceError
 from plushsense.devices import ble
-from plushsense.devices.base import Device
+from plushsense.devices.base import Device, ReconnectingDevice
 from plushsense.devices.opening import open_device
-from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
@@ -84,7 +83,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 PROGRAM = """
 import sys
 from plushsense.devices.opening import open_device
-from plushsense.devices.reconnect import ReconnectingDevice
+from plushsense.devices.base import ReconnectingDevice
 device = open_device(sys.argv[1])
 while device.counters.frames < 20:
     device.read()

@@ -15,10 +15,9 @@ from tests.support.sent_lines import NAMED, toy_of_lines
 
 from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError
 from plushsense.core.layouts import Channel, CsvFormat, Layout, load_layout
-from plushsense.devices.base import Device, Frame
+from plushsense.devices.base import Device, Frame, ReconnectingDevice
 from plushsense.devices.lsl import LslOutlet, forward, load_pylsl, name_url
 from plushsense.devices.opening import open_device
-from plushsense.devices.reconnect import ReconnectingDevice
 
 PLUSH = load_layout("plush-15")
 PHONE = load_layout("phone-6")

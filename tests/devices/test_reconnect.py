@@ -14,9 +14,8 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import load_layout
-from plushsense.devices.base import Device, Frame
+from plushsense.devices.base import Device, Frame, ReconnectingDevice
 from plushsense.devices.opening import open_device
-from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.server import ToyServer
 from plushsense.devices.virtual.stream import ToySpec
 

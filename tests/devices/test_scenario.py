@@ -10,9 +10,8 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import load_layout
-from plushsense.devices.base import Frame
+from plushsense.devices.base import Frame, ReconnectingDevice
 from plushsense.devices.opening import open_device
-from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.scenario import HumidityPoint, ScenarioPart, ToyScenario, load_scenario
 from plushsense.devices.virtual.stream import Prompt, ToyLine, ToySpec, ToyStream, VirtualDevice
 from plushsense.devices.virtual.world import CHANNELS

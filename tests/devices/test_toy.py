@@ -15,9 +15,8 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import load_layout
-from plushsense.devices.base import Device
+from plushsense.devices.base import Device, ReconnectingDevice
 from plushsense.devices.opening import open_device
-from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual import server
 from plushsense.devices.virtual.faults import Fault
 from plushsense.devices.virtual.scenario import ScenarioPart, ToyScenario

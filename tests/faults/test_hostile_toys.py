@@ -20,7 +20,7 @@ from plushsense.devices.opening import open_device
 from plushsense.live.loop import run_live
 from plushsense.models.bundle import Bundle
 from plushsense.recording.recorder import Recorder
-from plushsense.recording.request import SessionRequest, session_head
+from plushsense.recording.session import SessionRequest, session_head
 from plushsense.runtime.classifier import StreamClassifier
 from support.bundles import odd_bundle
 from support.drills import REPETITIONS

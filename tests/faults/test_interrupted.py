@@ -22,7 +22,7 @@ import pytest
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name, read_stream
 from plushsense.recording.session import is_finished
-from plushsense.recording.session_files import read_events
+from plushsense.recording.writer import read_events
 from support.drills import REPETITIONS, Drill, Fault, Ran, appending, contents, names, run, server, start
 
 pytestmark = [

@@ -31,8 +31,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.recording import session as sessions
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.session import OpenSession
-from plushsense.recording.session_files import SessionHead
-from plushsense.recording.writer import StreamFile
+from plushsense.recording.writer import SessionHead, StreamFile
 from support.bundles import odd_bundle
 from support.c_toy import C_FOLDER, TOY_C, Seat, library_of
 from support.integers import plain_model

@@ -11,16 +11,16 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.layouts import load_layout
 from plushsense.devices.opening import open_device
 from plushsense.recording.recorder import AutoRecording, Recorder
-from plushsense.recording.request import (
+from plushsense.recording.session import (
     SessionRequest,
     check_speed,
     is_pseudo_terminal,
     lacks_consent,
+    list_sessions,
     session_folder,
     session_head,
     session_layout,
 )
-from plushsense.recording.session import list_sessions
 
 LAYOUT = load_layout("plush-15")
 URL = "virtual://?speed=0&lost=0&garbled=0&glitch=0"

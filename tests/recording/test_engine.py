@@ -22,17 +22,15 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError, DeviceError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, read_recording, read_stream
-from plushsense.devices.base import Device, Frame, now_ms
+from plushsense.devices.base import Device, Frame, ReconnectingDevice, now_ms
 from plushsense.devices.opening import open_device
-from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.recording import recorder as machine
 from plushsense.recording import takes
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.recorder import AutoRecording, Recorder, prompt_virtual
 from plushsense.recording.session import OpenSession
-from plushsense.recording.session_files import SessionHead, discarded_recordings, read_events
 from plushsense.recording.status import RecorderStatus
-from plushsense.recording.writer import StreamFile
+from plushsense.recording.writer import SessionHead, StreamFile, discarded_recordings, read_events
 
 pytestmark = pytest.mark.slow
 
@@ -600,7 +598,7 @@ from plushsense.devices.opening import open_device
 from plushsense.recording.recorder import Recorder
 from plushsense.recording.recorder import AutoRecording
 from plushsense.recording.plan import load_protocol
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.writer import SessionHead
 
 head = SessionHead("S01", "1", 5, load_layout("plush-15").to_dict(), load_protocol("quick").to_dict(), simulated=True)
 before = resource.getrlimit(resource.RLIMIT_NOFILE)

@@ -27,8 +27,16 @@ from plushsense.recording.session import (
     next_session,
     session_names,
 )
-from plushsense.recording.session_files import SESSION_LOG, SessionEvent, SessionHead, discarded_recordings, read_events
-from plushsense.recording.writer import StreamFile, save_take, to_frames
+from plushsense.recording.writer import (
+    SESSION_LOG,
+    SessionEvent,
+    SessionHead,
+    StreamFile,
+    discarded_recordings,
+    read_events,
+    save_take,
+    to_frames,
+)
 
 ACCEL = load_layout("accel-3")
 HEAD = SessionHead(

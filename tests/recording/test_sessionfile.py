@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.recording.session_files import (
+from plushsense.recording.writer import (
     SESSION_HEAD,
     SESSION_LOG,
     SessionEvent,

@@ -19,7 +19,7 @@ from plushsense.core.recorder_csv import STREAM_NAME, parse_name, read_stream
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import PersonInfo, read_people
 from plushsense.devices.virtual.session import GESTURES
-from plushsense.recording.session_files import SESSION_LOG, read_events
+from plushsense.recording.writer import SESSION_LOG, read_events
 from plushsense.workflow.datasets import check_dataset
 from support.pty_toys import LAYOUT, Toy, check_whole, pty_toy, recordings
 from support.traced import SocketTrace

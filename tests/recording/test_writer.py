@@ -13,13 +13,14 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import read_recording, read_stream
 from plushsense.devices.base import Frame
 from plushsense.devices.wire import LineParser
-from plushsense.recording.session_files import SessionEvent, read_events
 from plushsense.recording.writer import (
     FLUSH_S,
     AppendedFile,
     BackgroundWriter,
     LogFile,
+    SessionEvent,
     StreamFile,
+    read_events,
     save_take,
     to_frames,
 )

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch, ConvLayer
 from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.integer import IntegerLayer, IntegerNetwork, rounded_weights
-from plushsense.runtime.vectors import down_for
+from plushsense.runtime.integer import IntegerLayer, IntegerNetwork, down_for, rounded_weights
 from support.integers import INT32, any_network, models, plain_model, vector_model, window_model
 
 

@@ -18,7 +18,7 @@ import pytest
 from plushsense.core.layouts import load_layout
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.session import OpenSession
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.writer import SessionHead
 from support.browsing import DESK, TABLET, Look, axe, connected, marked
 from support.bundles import OTHER, odd_bundle
 

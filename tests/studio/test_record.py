@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from plushsense.recording.session import is_finished
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.writer import SessionHead
 from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
 from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, stop, take, whats
 from support.waiting import until

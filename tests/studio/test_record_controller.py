@@ -15,9 +15,8 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError, DeviceError, PlushSenseError
 from plushsense.devices.virtual.stream import VirtualDevice
-from plushsense.recording.request import SessionRequest
-from plushsense.recording.session import OpenSession
-from plushsense.recording.session_files import SessionEvent, SessionHead, read_events
+from plushsense.recording.session import OpenSession, SessionRequest
+from plushsense.recording.writer import SessionEvent, SessionHead, read_events
 from plushsense.studio.app import toys
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.record.controller import MARKERS, NO_CONSENT, PSEUDO, ActiveSession, RecordController

@@ -13,7 +13,7 @@ import pytest
 
 from plushsense.core.recorder_csv import parse_name
 from plushsense.devices.virtual.session import GESTURES
-from plushsense.recording.session_files import SESSION_LOG, SessionHead, read_events
+from plushsense.recording.writer import SESSION_LOG, SessionHead, read_events
 from support.browsing import connected, marked
 from support.pty_toys import check_whole, pty_toy, recordings
 from support.recording_pages import choose, showing, start_recording, stop

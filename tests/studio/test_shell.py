@@ -17,7 +17,7 @@ import pytest
 
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.deploy.code import FACTS
-from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG
+from plushsense.recording.writer import SESSION_HEAD, SESSION_LOG
 from plushsense.studio.app import shell
 from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES, TOUR, page_texts
 from plushsense.studio.app.words import Words

@@ -14,8 +14,7 @@ from plushsense.core.recorder_csv import read_recording
 from plushsense.devices.base import Frame
 from plushsense.recording import writer
 from plushsense.recording.session import next_session
-from plushsense.recording.session_files import SessionHead, read_events
-from plushsense.recording.writer import StreamFile
+from plushsense.recording.writer import SessionHead, StreamFile, read_events
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording

@@ -11,7 +11,7 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import load_gestures
-from plushsense.recording.session_files import read_events
+from plushsense.recording.writer import read_events
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording

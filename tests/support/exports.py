@@ -9,7 +9,7 @@ import numpy as np
 
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.deploy.emit import emit
+from plushsense.deploy.package import emit
 from plushsense.deploy.quantize import calibrated, integer_model
 from plushsense.models.arch import Arch, parse_symbol
 from plushsense.models.bundle import Bundle

@@ -18,8 +18,7 @@ from plushsense.runtime.fixed import InputScale, LogitScale, Requantize, split_r
 from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.integer import IntegerDense, IntegerLayer, IntegerNetwork
-from plushsense.runtime.vectors import MOST_DOWN, IntegerVectors, down_for
+from plushsense.runtime.integer import MOST_DOWN, IntegerDense, IntegerLayer, IntegerNetwork, IntegerVectors, down_for
 
 Ints = NDArray[np.int64]
 INT32 = -(1 << 31), (1 << 31) - 1

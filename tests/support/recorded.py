@@ -6,7 +6,7 @@ from pathlib import Path
 
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.recorder import AutoRecording, Recorder, open_toy, prompt_virtual
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.writer import SessionHead
 from plushsense.studio.app.workspace import Workspace
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from plushsense.core.layouts import load_layout
 from plushsense.devices.virtual.server import ToyServer
 from plushsense.devices.virtual.stream import ToySpec
-from plushsense.recording.session_files import SessionEvent, read_events
+from plushsense.recording.writer import SessionEvent, read_events
 from support.browsing import connected, marked
 from support.pty_toys import QUIET
 

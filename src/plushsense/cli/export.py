@@ -13,8 +13,7 @@ from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.deploy.code import ConversionFacts
-    from plushsense.deploy.paper_estimate import PaperComparison
-    from plushsense.deploy.profile import Cost, Profile
+    from plushsense.deploy.profile import Cost, PaperComparison, Profile
     from plushsense.deploy.proof.verify import VerificationResult
 
 _SAMPLES = 100_000
@@ -159,7 +158,7 @@ def run_profile(args: argparse.Namespace) -> int:
     if not args.paper:
         emit(args, result.to_json(), format_profile(result))
         return 0
-    from plushsense.deploy.paper_estimate import compare_with_paper
+    from plushsense.deploy.profile import compare_with_paper
 
     paper = compare_with_paper(result)
     emit(args, result.to_json() | {"paper": paper.to_json()}, format_profile(result) + format_paper(paper))
@@ -168,7 +167,7 @@ def run_profile(args: argparse.Namespace) -> int:
 
 def format_paper(paper: PaperComparison) -> list[str]:
     """Format the paper's estimate beside ours as text."""
-    from plushsense.deploy.paper_estimate import FLOAT_MMAC_S, INT16_MMAC_S, OURS_ASSUMES, PAPER_ASSUMES
+    from plushsense.deploy.profile import FLOAT_MMAC_S, INT16_MMAC_S, OURS_ASSUMES, PAPER_ASSUMES
 
     def written(ms: float) -> str:
         return f"{ms:.2f}" if ms < 1 else f"{ms:.1f}" if ms < 10 else f"{ms:.0f}"

@@ -16,8 +16,8 @@ from plushsense.core.errors import ConfigError
 if TYPE_CHECKING:
     from plushsense.cli.terminal import KeySource, Screen
     from plushsense.recording.recorder import Recorder
-    from plushsense.recording.request import SessionRequest
-    from plushsense.recording.session_files import SessionHead
+    from plushsense.recording.session import SessionRequest
+    from plushsense.recording.writer import SessionHead
 
 _DRAW_S = 0.1
 _WAIT_S = 0.02
@@ -28,8 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.core.version import __version__
     from plushsense.devices.opening import with_speed
     from plushsense.recording.recorder import AutoRecording, Recorder, open_toy, prompt_virtual
-    from plushsense.recording.request import session_folder, session_head, session_layout
-    from plushsense.recording.session import OpenSession
+    from plushsense.recording.session import OpenSession, session_folder, session_head, session_layout
 
     software = f"plushsense {__version__}"
     request = _request(args)
@@ -84,7 +83,7 @@ def _report(args: argparse.Namespace, recorder: Recorder) -> int:
 
 def _request(args: argparse.Namespace) -> SessionRequest:
     from plushsense.devices.opening import speed_of
-    from plushsense.recording.request import SessionRequest, check_speed
+    from plushsense.recording.session import SessionRequest, check_speed
 
     if args.auto is not None and not 0.5 <= args.auto <= 3600.0:
         raise ConfigError(f"--auto is {args.auto:g}; 0.5 to 3600 seconds are accepted.")
@@ -99,7 +98,7 @@ def _request(args: argparse.Namespace) -> SessionRequest:
 
 def _notices(request: SessionRequest, head: SessionHead, fresh: bool) -> list[str]:
     """Return the warnings to print before a session."""
-    from plushsense.recording.request import is_pseudo_terminal, lacks_consent
+    from plushsense.recording.session import is_pseudo_terminal, lacks_consent
 
     notices = []
     if is_pseudo_terminal(request, head):

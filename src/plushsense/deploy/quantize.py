@@ -35,8 +35,17 @@ from plushsense.runtime.fixed import (
     split_ratio,
 )
 from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.integer import IntegerDense, IntegerLayer, IntegerNetwork, deployable, rounded_weights
-from plushsense.runtime.vectors import AXIS_LIMIT, MOST_AXIS_SHIFT, IntegerVectors, down_for
+from plushsense.runtime.integer import (
+    AXIS_LIMIT,
+    MOST_AXIS_SHIFT,
+    IntegerDense,
+    IntegerLayer,
+    IntegerNetwork,
+    IntegerVectors,
+    deployable,
+    down_for,
+    rounded_weights,
+)
 from plushsense.windows.features import Scaler
 
 Floats = NDArray[np.float64]

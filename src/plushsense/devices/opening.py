@@ -16,8 +16,7 @@ from urllib.parse import unquote
 from plushsense.core.errors import AddressError, ConfigError, DeviceError, MissingExtraError, PlushSenseError, nearest
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.sentences import Message
-from plushsense.devices.base import Device
-from plushsense.devices.reconnect import ReconnectingDevice
+from plushsense.devices.base import Device, ReconnectingDevice
 
 DEFAULT_LAYOUT = "plush-15"
 

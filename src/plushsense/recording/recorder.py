@@ -27,10 +27,18 @@ from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.session import OpenSession
-from plushsense.recording.session_files import FORMAT_VERSION, SessionEvent, SessionHead
 from plushsense.recording.status import PlanProgress, RecorderState, RecorderStatus, StepResult, key_of
 from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, StreamGap, measured_rate_hz
-from plushsense.recording.writer import BackgroundWriter, StreamFile, lacks_descriptor, save_take, to_frames
+from plushsense.recording.writer import (
+    FORMAT_VERSION,
+    BackgroundWriter,
+    SessionEvent,
+    SessionHead,
+    StreamFile,
+    lacks_descriptor,
+    save_take,
+    to_frames,
+)
 
 _NO_DESCRIPTOR = Message(
     "Too many files are open on this computer: saving waits until some are closed. Nothing is lost."

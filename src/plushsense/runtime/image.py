@@ -57,8 +57,7 @@ from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import PROBABILITY_BITS, LogitScale, Requantize
 from plushsense.runtime.gate import JERK
-from plushsense.runtime.integer import IntegerNetwork
-from plushsense.runtime.vectors import MOST_AXIS_SHIFT, IntegerVectors
+from plushsense.runtime.integer import MOST_AXIS_SHIFT, IntegerNetwork, IntegerVectors
 
 MAGIC = b"PLSH"
 PATCH_MAGIC = b"PLPT"

@@ -21,7 +21,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.deploy.code import IMAGE, check_names, read_facts
 from plushsense.deploy.convert import check_format
 from plushsense.deploy.convert.matlab import cells, mat_bytes
-from plushsense.deploy.emit import ExportResult, emit
+from plushsense.deploy.package import ExportResult, emit
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.bundle import Bundle, is_training_content

@@ -18,7 +18,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.store import PersonInfo, read_people, write_people
-from plushsense.recording.session_files import SessionEvent
+from plushsense.recording.writer import SessionEvent
 
 Writer = Callable[..., Path]
 ACCEL = load_layout("accel-3")

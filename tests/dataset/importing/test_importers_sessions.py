@@ -14,7 +14,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import PersonInfo, read_people
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.writer import SessionHead
 
 Writer = Callable[..., Path]
 

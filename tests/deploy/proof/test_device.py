@@ -18,8 +18,7 @@ import pytest
 
 from plushsense.cli.main import main
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.deploy.emit import emit
-from plushsense.deploy.package import ON_CHIP
+from plushsense.deploy.package import ON_CHIP, emit
 from plushsense.deploy.proof import device
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.quantize import integer_model

@@ -66,7 +66,7 @@ from plushsense.dataset.store import (
     read_people,
     write_people,
 )
-from plushsense.recording.session_files import SESSION_LOG
+from plushsense.recording.writer import SESSION_LOG
 
 RECORDER = "recorder"
 TWICE = Message("the same file was already imported")

@@ -32,7 +32,7 @@ from plushsense.dataset.importing.sources import (
 from plushsense.dataset.importing.truncation import find_truncation
 from plushsense.dataset.importing.xdf import convert_xdf, is_xdf
 from plushsense.dataset.store import RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo
-from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
+from plushsense.recording.writer import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
 
 _ASK = (
     "import from the folder that holds one folder a person, or name the people with --subjects map.csv (file,subject)"

@@ -34,8 +34,7 @@ from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, VectorLayer, r
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import affine
 from plushsense.models.vectors import LENGTH_EPSILON, TURN_EPSILON
-from plushsense.runtime.integer import IntegerNetwork
-from plushsense.runtime.vectors import AXIS_LIMIT
+from plushsense.runtime.integer import AXIS_LIMIT, IntegerNetwork
 from plushsense.windows.features import InputUnits, Scaler
 
 OPSET = 13
@@ -166,7 +165,7 @@ def _invariants(
     """Add the vector layer, before its standardization.
 
     ``weights`` (V, K, taps) and ``epsilons`` are those of `plushsense.models.vectors`; ``sizes`` (V,) multiply the axes
-    of each vector, which are then clipped as in `plushsense.runtime.vectors`.
+    of each vector, which are then clipped as in `plushsense.runtime.integer`.
     """
     others, one = arch.channels - layer.axes, g.constant("axis.1", np.array([1], dtype=np.int64))
 

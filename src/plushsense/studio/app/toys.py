@@ -16,7 +16,7 @@ from plushsense.core.errors import ConfigError, DeviceError, PlushSenseError
 from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.sentences import Message
-from plushsense.devices.base import Device, Frame
+from plushsense.devices.base import ConnectionGap, Device, Frame
 from plushsense.devices.opening import (
     DEFAULT_LAYOUT,
     SCAN_S,
@@ -29,7 +29,6 @@ from plushsense.devices.opening import (
     speed_of,
     with_speed,
 )
-from plushsense.devices.reconnect import ConnectionGap
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.windows.clock import SampleClock
 
@@ -151,7 +150,7 @@ class TappedDevice(Device):
 
     @property
     def state(self) -> str:
-        """State of the connection, see `plushsense.devices.reconnect.ReconnectingDevice`."""
+        """State of the connection, see `plushsense.devices.base.ReconnectingDevice`."""
         return str(getattr(self.device, "state", "connected"))
 
     @property

@@ -20,7 +20,7 @@ from plushsense.dataset.importing.archives import DEVICE_NAME
 from plushsense.dataset.index import change_head
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import DatasetHead
-from plushsense.recording.session_files import SESSION_HEAD
+from plushsense.recording.writer import SESSION_HEAD
 
 RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bundles", "exports", "packages"
 WORK, DISCARDED, BACKUPS = "work", "discarded", "backups"

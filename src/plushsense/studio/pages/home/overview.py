@@ -21,7 +21,7 @@ from plushsense.dataset.marks import MARKS
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
 from plushsense.models.bundle import Bundle
 from plushsense.recording.session import is_finished
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.writer import SessionHead
 from plushsense.studio.app.workspace import BACKUPS, EXPORTS, Workspace, file_stamps
 
 INDEX = "recordings.csv"

@@ -20,7 +20,7 @@ from plushsense.live.loop import LiveRun
 from plushsense.live.loop import run_live as run_on
 from plushsense.live.reactions import Reactor, load_reactions
 from plushsense.models.bundle import Bundle
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.writer import SessionHead
 from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.toys import TappedDevice

@@ -25,9 +25,8 @@ from plushsense.models.bundle import Bundle
 from plushsense.recording.plan import Protocol, Step
 from plushsense.recording.recorder import store_take
 from plushsense.recording.session import OpenSession, check_subject, new_event, new_session
-from plushsense.recording.session_files import SessionEvent, SessionHead
 from plushsense.recording.takes import FrameReceiver, RecordingTake, StreamGap
-from plushsense.recording.writer import BackgroundWriter, StreamFile
+from plushsense.recording.writer import BackgroundWriter, SessionEvent, SessionHead, StreamFile
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.reader import LiveReader

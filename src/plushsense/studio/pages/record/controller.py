@@ -17,24 +17,22 @@ from plushsense.devices.opening import is_virtual, parse_url, speed_of, with_spe
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.plan import save_protocol
 from plushsense.recording.recorder import Recorder, open_toy, prompt_virtual, send_markers
-from plushsense.recording.request import (
+from plushsense.recording.session import (
+    OpenSession,
     SessionRequest,
+    SessionSummary,
+    change_subject,
     check_speed,
+    is_finished,
     is_pseudo_terminal,
     lacks_consent,
+    list_sessions,
+    mark_finished,
     session_folder,
     session_head,
     session_layout,
 )
-from plushsense.recording.session import (
-    OpenSession,
-    SessionSummary,
-    change_subject,
-    is_finished,
-    list_sessions,
-    mark_finished,
-)
-from plushsense.recording.session_files import SESSION_HEAD, SessionHead
+from plushsense.recording.writer import SESSION_HEAD, SessionHead
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import PROTOCOLS, VIRTUAL, ChangeSignal, Workspace
 

@@ -12,8 +12,7 @@ from nicegui import run, ui
 
 from plushsense.core.errors import AddressError, ConfigError, DeviceError, LayoutError, PlushSenseError
 from plushsense.recording.plan import DEFAULT, wordings
-from plushsense.recording.request import PROTOCOL, SessionRequest
-from plushsense.recording.session import SessionSummary
+from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary
 from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import CHILD, show_child

@@ -17,9 +17,9 @@ from plushsense.core.recorder_csv import parse_name, read_recording
 from plushsense.core.toml import loads_json
 from plushsense.dataset.quality.comparisons import usual_seconds
 from plushsense.dataset.quality.findings import CheckLimits
-from plushsense.recording.session_files import SIDECAR, discarded_recordings
 from plushsense.recording.status import RecorderStatus
 from plushsense.recording.takes import duration_s
+from plushsense.recording.writer import SIDECAR, discarded_recordings
 from plushsense.reports.quality_figures import line
 from plushsense.studio.app.shell import Page, html, tag
 from plushsense.studio.app.words import Texts, Words

@@ -11,8 +11,8 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 from plushsense.core.errors import DatasetError, PlushSenseError
-from plushsense.recording.session_files import SessionHead
 from plushsense.recording.status import RecorderStatus
+from plushsense.recording.writer import SessionHead
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Texts, Words
