@@ -30,7 +30,7 @@ from plushsense.deploy.proof.verify import Setting
 from plushsense.experiments.baselines.run import chosen
 from plushsense.live.adaptation import DENSE
 from plushsense.models.bundle import Bundle
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.studio.app import serve
 from plushsense.workflow.api import import_simulation
 from support.kept_objects import keeping_answers, keeping_objects
@@ -265,7 +265,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the commands of the pages need: recordings, a data set, bundles, an export, small files."""
     folder = tmp_path_factory.mktemp("pages")
-    simulate(folder / "RECORDINGS", people=5, repetitions=3, gestures=GESTURES, at_rest=2)
+    simulate(folder / "RECORDINGS", SimulationSpec(people=5, repetitions=3, gestures=GESTURES, at_rest=2))
     with_gap = next((folder / "RECORDINGS" / "P02").glob("Hold strong_*.csv"))
     lines = with_gap.read_bytes().splitlines(keepends=True)
     with_gap.write_bytes(b"".join(lines[:40] + lines[80:]))

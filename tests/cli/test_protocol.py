@@ -16,7 +16,7 @@ from plushsense.experiments.protocol.score import NOTES
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.windows.features import Scaler
 from support.real_times import copied_as_if_real
 
@@ -42,7 +42,9 @@ def model(tmp_path_factory):
 def sessions(tmp_path_factory):
     """Two people's folders as a recorder leaves them, of a virtual toy."""
     folder = tmp_path_factory.mktemp("sessions") / "raw"
-    simulate(folder, 2, 9, 1, at_rest=0, gestures=("Back stroke 1", "Tail hit 1"))
+    simulate(
+        folder, SimulationSpec(people=2, seed=9, repetitions=1, at_rest=0, gestures=("Back stroke 1", "Tail hit 1"))
+    )
     return folder
 
 

@@ -260,10 +260,10 @@ def test_a_missing_consent_is_said_once(cli: Cli, tmp_path: Path, real_toy_url: 
 @pytest.fixture
 def real_toy_url(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A toy that is not virtual: a stream that is played back."""
-    from plushsense.recording.simulate import simulate
+    from plushsense.recording.simulate import SimulationSpec, simulate
 
     out = tmp_path_factory.mktemp("sim") / "out"
-    simulate(out, people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"])
+    simulate(out, SimulationSpec(people=1, repetitions=1, at_rest=0, gestures=("Tail hit 1",)))
     return f"replay://{out / 'P01' / 'fulldatastream.csv'}"
 
 

@@ -22,7 +22,7 @@ from plushsense.dataset.index import change_head, open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.publishing.package import missing_statements
 from plushsense.dataset.store import Dataset, DatasetHead, RecordingInfo, read_index
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 
 ACCEL = load_layout("accel-3")
 
@@ -163,7 +163,7 @@ def test_a_disk_that_cannot_be_written_still_opens(folder: Path, monkeypatch: py
 
 
 def test_recordings_of_delays_are_found_in_their_stream(tmp_path: Path) -> None:
-    simulate(tmp_path / "old", people=1, repetitions=1, at_rest=0, layout="plush-14")
+    simulate(tmp_path / "old", SimulationSpec(people=1, repetitions=1, at_rest=0, layout="plush-14"))
     done = import_recordings(tmp_path / "old", tmp_path / "DS", layout="plush-14")
     assert done.recordings == 17
     rows = [r.stream_row for r in done.dataset.recordings]

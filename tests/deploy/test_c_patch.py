@@ -15,7 +15,7 @@ import pytest
 from plushsense.core.errors import BundleError
 from plushsense.deploy.golden import ANSWER, EVENT, HEAD, TRACKING, answers_of, answers_over_patches, column
 from plushsense.deploy.quantize import integer_model
-from plushsense.deploy.targets import build
+from plushsense.deploy.targets import CompileSpec, build
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import HEAD_BYTES, PATCH_MAGIC, IntegerModel, image_check, image_head, patch_bytes
 from support.c_toy import C_FOLDER, Seat, seat
@@ -206,9 +206,9 @@ def test_on_an_emulated_chip(target: str, tmp_path: Path, target_here: Callable[
         target_here(target),
         [tmp_path / "main.c", C_FOLDER / "plushsense.c"],
         tmp_path / "out",
+        CompileSpec(flags=("-DCHANNELS=4", "-DNULL_PATCH=(const uint8_t*)0")),
         include=[C_FOLDER],
         blobs={name: tmp_path / name for name in blobs},
-        defines={"CHANNELS": 4, "NULL_PATCH": "(const uint8_t*)0"},
     )
     logits = np.frombuffer(program.run(timeout_s=60), "<i4").reshape(-1, 3)
     assert len(logits) > 50 and np.array_equal(logits, rows[:, HEAD : HEAD + 3])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BuildError, ConfigError, ProgramError, ToolError
-from plushsense.deploy.targets import TARGETS, build, missing_tools, require, target_named
+from plushsense.deploy.targets import TARGETS, CompileSpec, build, missing_tools, require, target_named
 
 EMULATED = [name for name, target in TARGETS.items() if target.run]
 Here = Callable[[str], str]
@@ -104,13 +104,15 @@ def test_bytes_go_in_and_come_out_as_they_are(target: str, tmp_path: Path, targe
     blob = folder / "blob"
     blob.write_bytes(np.random.default_rng(1).integers(0, 256, 6_000_001, dtype=np.uint8).tobytes())
     source = written(folder, ECHO)
-    program = build(target, [source], folder / "out", blobs={"BLOB": blob}, defines={"STATUS": 0})
+    program = build(target, [source], folder / "out", CompileSpec(flags=("-DSTATUS=0",)), blobs={"BLOB": blob})
     assert program.run(timeout_s=60) == blob.read_bytes()
     assert [o.is_file() for o in program.objects] == [True]
     blob.write_bytes(b"")
-    assert build(target, [source], folder / "out", blobs={"BLOB": blob}, defines={"STATUS": 0}).run() == b""
+    assert (
+        build(target, [source], folder / "out", CompileSpec(flags=("-DSTATUS=0",)), blobs={"BLOB": blob}).run() == b""
+    )
     with pytest.raises(ProgramError, match="ended with status 5 instead of 0"):
-        build(target, [source], folder / "out", blobs={"BLOB": blob}, defines={"STATUS": 5}).run()
+        build(target, [source], folder / "out", CompileSpec(flags=("-DSTATUS=5",)), blobs={"BLOB": blob}).run()
 
 
 @pytest.mark.parametrize("target", EMULATED)
@@ -136,7 +138,9 @@ def test_division_products_and_memory_functions(target: str, tmp_path: Path, tar
     file = tmp_path / "pairs"
     file.write_bytes(np.array(numbers, "<u4").tobytes())
     source = written(tmp_path, ARITHMETIC)
-    output = build(target_here(target), [source], tmp_path, blobs={"PAIRS": file}, flags=["-fno-builtin"]).run()
+    output = build(
+        target_here(target), [source], tmp_path, CompileSpec(flags=("-fno-builtin",)), blobs={"PAIRS": file}
+    ).run()
     values = np.frombuffer(output[:-17], "<u4").reshape(-1, 8).tolist()
     assert output[-17:] == b"\x07aaabcdefg\x07\x07\x07\x07\x07\x07\x01".replace(b"\x07aaabc", b"\x07ababc")
     mask = 0xFFFFFFFF
@@ -172,13 +176,21 @@ def test_what_a_compiler_refuses(target: str, tmp_path: Path, target_here: Here)
     with pytest.raises(BuildError, match="refused the program: .*undefined reference to .f'"):
         build(target, [written(tmp_path, "int f(void); int main(void) { return f(); }")], tmp_path)
     with pytest.raises(BuildError, match="unused"):
-        build(target, [written(tmp_path, "int main(void) { int u; return 0; }")], tmp_path, flags=["-Wall", "-Werror"])
+        build(
+            target,
+            [written(tmp_path, "int main(void) { int u; return 0; }")],
+            tmp_path,
+            CompileSpec(flags=("-Wall", "-Werror")),
+        )
 
 
 def test_another_compiler_on_the_host(tmp_path: Path, needs: Callable[..., None]) -> None:
     needs("gcc", "clang")
     source = written(tmp_path, '#include "target.h"\nint main(void) { target_write(__VERSION__, 5); return 0; }')
-    assert build("host", [source], tmp_path / "a", cc="clang").run() != build("host", [source], tmp_path / "b").run()
+    assert (
+        build("host", [source], tmp_path / "a", CompileSpec("clang")).run()
+        != build("host", [source], tmp_path / "b").run()
+    )
 
 
 def test_missing_tools_are_named_by_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -190,7 +202,7 @@ def test_missing_tools_are_named_by_package(monkeypatch: pytest.MonkeyPatch, tmp
         "qemu-system-misc",
         "picolibc-riscv64-unknown-elf",
     ]
-    assert missing_tools("host", cc="clang") == ["clang"]
+    assert missing_tools("host", CompileSpec("clang")) == ["clang"]
     with pytest.raises(ToolError, match="install Debian's gcc-xtensa-lx106 qemu-system-misc .*, or leave this target"):
         require("xtensa")
     with pytest.raises(ToolError):

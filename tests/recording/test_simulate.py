@@ -21,7 +21,7 @@ from plushsense.devices.virtual.scenario import load_scenario
 from plushsense.devices.virtual.session import GESTURES, VirtualSession
 from plushsense.devices.virtual.stream import ToySpec
 from plushsense.devices.virtual.world import draw_person
-from plushsense.recording.simulate import play_to_folder, repetitions_made, simulate
+from plushsense.recording.simulate import SimulationSpec, play_to_folder, repetitions_made, simulate
 
 PLUSH = load_layout("plush-15")
 SCENARIO = Path(__file__).resolve().parents[2] / "examples" / "files" / "scenario.toml"
@@ -31,7 +31,7 @@ SCENARIO = Path(__file__).resolve().parents[2] / "examples" / "files" / "scenari
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("sim") / "people"
     seen: list[tuple[int, int, str]] = []
-    summary = simulate(out, people=2, repetitions=1, at_rest=3, progress=lambda *a: seen.append(a))
+    summary = simulate(out, SimulationSpec(people=2, repetitions=1, at_rest=3), progress=lambda *a: seen.append(a))
     assert seen == [(1, 3, "P01"), (2, 3, "P02"), (3, 3, "none")]
     assert summary.recordings == 2 * 17 + 3
     assert summary.people == 2
@@ -93,9 +93,9 @@ def test_the_same_seed_writes_the_same_files(folder: Path, tmp_path: Path) -> No
     def digest(root: Path) -> dict[str, str]:
         return {str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest() for p in root.rglob("*.csv")}
 
-    simulate(tmp_path / "again", people=2, repetitions=1, at_rest=3)
+    simulate(tmp_path / "again", SimulationSpec(people=2, repetitions=1, at_rest=3))
     assert digest(tmp_path / "again") == digest(folder)
-    simulate(tmp_path / "other", people=1, repetitions=1, at_rest=0, gestures=["Tail pull"], seed=2)
+    simulate(tmp_path / "other", SimulationSpec(people=1, repetitions=1, at_rest=0, gestures=("Tail pull",), seed=2))
     assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["P01", "SIMULATION.txt"]
     assert digest(tmp_path / "other").items().isdisjoint(digest(folder).items())
 
@@ -103,7 +103,9 @@ def test_the_same_seed_writes_the_same_files(folder: Path, tmp_path: Path) -> No
 def test_other_layouts(tmp_path: Path) -> None:
     for name in ("plush-14", "accel-3"):
         layout = load_layout(name)
-        simulate(tmp_path / name, people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"], layout=name)
+        simulate(
+            tmp_path / name, SimulationSpec(people=1, repetitions=1, at_rest=0, gestures=("Tail hit 1",), layout=name)
+        )
         frames = read_stream(tmp_path / name / "P01" / "fulldatastream.csv", layout).frames
         assert frames.values.shape[1] == layout.n_channels
 
@@ -114,15 +116,17 @@ def test_refusals(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="empty folder"):
         simulate(tmp_path / "full")
     with pytest.raises(ConfigError, match="people"):
-        simulate(tmp_path / "none", people=0)
+        simulate(tmp_path / "none", SimulationSpec(people=0))
     with pytest.raises(ConfigError, match="Tail kick"):
-        simulate(tmp_path / "none", gestures=["Tail kick"])
+        simulate(tmp_path / "none", SimulationSpec(gestures=("Tail kick",)))
     assert not (tmp_path / "none").exists()
 
 
 def test_older_firmware_leaves_delays_in_the_clock_column(tmp_path: Path) -> None:
     layout = load_layout("plush-14")
-    simulate(tmp_path / "old", people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"], layout=layout)
+    simulate(
+        tmp_path / "old", SimulationSpec(people=1, repetitions=1, at_rest=0, gestures=("Tail hit 1",), layout=layout)
+    )
     path = tmp_path / "old" / "P01" / "fulldatastream.csv"
     last = [int(line.split("; ")[-1]) for line in path.read_text(encoding="utf-8").splitlines()]
     assert max(last) < 1000
@@ -137,12 +141,12 @@ def test_a_users_folder_beside_is_left_alone(tmp_path: Path) -> None:
     mine = tmp_path / "out.simulating"
     mine.mkdir()
     (mine / "thesis.txt").write_text("x", encoding="utf-8")
-    simulate(tmp_path / "out", people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"])
+    simulate(tmp_path / "out", SimulationSpec(people=1, repetitions=1, at_rest=0, gestures=("Tail hit 1",)))
     assert (mine / "thesis.txt").is_file()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "out.simulating"]
     (tmp_path / "afile").write_text("x", encoding="utf-8")
     with pytest.raises(DatasetError, match="cannot be created"):
-        simulate(tmp_path / "afile" / "x", people=1, repetitions=1, at_rest=0, gestures=["Tail hit 1"])
+        simulate(tmp_path / "afile" / "x", SimulationSpec(people=1, repetitions=1, at_rest=0, gestures=("Tail hit 1",)))
 
 
 def test_a_virtual_toy_of_a_negative_person_is_refused() -> None:
@@ -236,7 +240,9 @@ def test_the_default_data_set_has_the_windows_of_the_authors_archive() -> None:
 
 
 def test_missing_recordings_are_gestures_that_nobody_made(tmp_path: Path) -> None:
-    summary = simulate(tmp_path / "many", people=4, repetitions=10, gestures=["Tail hit 1", "Tail pull"])
+    summary = simulate(
+        tmp_path / "many", SimulationSpec(people=4, repetitions=10, gestures=("Tail hit 1", "Tail pull"))
+    )
     names = [parse_name(p.name) for p in (tmp_path / "many").glob("*/*_*.csv")]
     made = {"Tail hit 1": 39, "Tail pull": 39, "At rest": 3}  # at rest is 2 × 10 × 4 / 25, rounded
     assert Counter(n.label for n in names if n) == made

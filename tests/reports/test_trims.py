@@ -7,14 +7,16 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.dataset.trimming import accept_suggestions, refresh_trims, suggest_trims
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.reports.quality_figures import PER_PAGE, save_trims, trim_page
 
 pytestmark = pytest.mark.slow
 
 
 def _dataset(folder: Path) -> Dataset:
-    simulate(folder / "raw", people=1, repetitions=2, at_rest=0, gestures=("Head stroke 1", "Hold strong"))
+    simulate(
+        folder / "raw", SimulationSpec(people=1, repetitions=2, at_rest=0, gestures=("Head stroke 1", "Hold strong"))
+    )
     return import_recordings(folder / "raw", folder / "DS", layout="plush-15").dataset
 
 

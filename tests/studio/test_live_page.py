@@ -321,9 +321,9 @@ def test_two_tabs_and_a_reload_show_the_present(studio: Fixture, look: Fixture, 
 
 def record_simulated(folder: Path) -> None:
     """Write a session of a virtual person who made every gesture twice, as the recorder leaves it."""
-    from plushsense.recording.simulate import simulate
+    from plushsense.recording.simulate import SimulationSpec, simulate
 
-    simulate(folder.parent / "made", 1, 5, 2, at_rest=0)
+    simulate(folder.parent / "made", SimulationSpec(people=1, seed=5, repetitions=2, at_rest=0))
     layout, protocol = load_layout("plush-15").to_dict(), load_protocol("plush-17").to_dict()
     head = SessionHead(folder.parent.name, folder.name, 0, layout, protocol, simulated=True)
     with contextlib.closing(OpenSession(folder, head)):

@@ -156,11 +156,11 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
 @pytest.fixture(scope="session")
 def lighter(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of six virtual people and 7 of the gestures, on which jobs take half the time; read only."""
-    from plushsense.recording.simulate import simulate
+    from plushsense.recording.simulate import SimulationSpec, simulate
     from plushsense.workflow.api import import_simulation
 
     def build(draft: Path) -> None:
-        simulate(draft / "made", people=6, repetitions=1, gestures=MADE)
+        simulate(draft / "made", SimulationSpec(people=6, repetitions=1, gestures=MADE))
         import_simulation(draft / "made", draft / "virtual", lambda *at: None)
         shutil.rmtree(draft / "made")
 

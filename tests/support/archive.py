@@ -7,7 +7,7 @@ import random
 from pathlib import Path
 
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 
 DELAYS = "Tail pull"
 
@@ -29,7 +29,7 @@ def make_archive(
     with CRLF, and those of `DELAYS` hold the delay in the last column, as older firmware sent it.
     """
     drawn = random.Random(seed)
-    simulate(folder / "sessions", people=people, repetitions=repetitions, seed=seed, gestures=gestures)
+    simulate(folder / "sessions", SimulationSpec(people=people, repetitions=repetitions, seed=seed, gestures=gestures))
     found = [(p.parent.name, p) for p in (folder / "sessions").rglob("*.csv") if parse_name(p.name) is not None]
     drawn.shuffle(found)
     archive = folder / "archive"

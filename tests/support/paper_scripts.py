@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 from support.matlab_files import write_mat
 
 SESSIONS, LABELLED, CHOICES = "Training Data", "Training Data - labelled", "truncate_choices.csv"
@@ -38,12 +38,14 @@ def record(
     sessions = root / SESSIONS
     simulate(
         sessions,
-        people=people,
-        repetitions=repetitions,
-        at_rest=at_rest,
-        seed=seed,
-        gestures=GESTURES,
-        layout=f"plush-{integers}",
+        SimulationSpec(
+            people=people,
+            repetitions=repetitions,
+            at_rest=at_rest,
+            seed=seed,
+            gestures=GESTURES,
+            layout=f"plush-{integers}",
+        ),
     )
     for path in sessions.rglob("*.csv"):
         lines = path.read_text().splitlines()

@@ -14,7 +14,7 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import fold_windows
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.scoring.splits import make_folds, parse_split
 from plushsense.windows.cut import WindowSet, WindowSpec, cut_windows
 from plushsense.workflow.export import save_windows
@@ -27,7 +27,7 @@ SETS = ("train", "validation", "test")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     root = tmp_path_factory.mktemp("matlab")
     gestures = ("Back stroke 1", "Tail pull", "Tail tap 2")
-    simulate(root / "recordings", people=3, repetitions=2, at_rest=2, seed=3, gestures=gestures)
+    simulate(root / "recordings", SimulationSpec(people=3, repetitions=2, at_rest=2, seed=3, gestures=gestures))
     return import_recordings(root / "recordings", root / "DS", layout="plush-15").dataset
 
 

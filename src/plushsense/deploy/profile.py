@@ -20,6 +20,7 @@ from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.targets import (
     C_FOLDER,
     TARGETS,
+    CompileSpec,
     Program,
     build,
     missing_tools,
@@ -273,14 +274,15 @@ def count(folder: Path, target: str, facts: ModelFacts, optimise: str = "-O2", *
         for frames, file in zip((even, jittered, stress), blobs.values(), strict=True):
             file.write_bytes(frames.astype("<i4").tobytes())
         sources = [C_FOLDER / "profile.c", code / MODEL[1]]
-        same = partial(build, target, include=[code], optimise=optimise, blobs=blobs)
-        whole = same([*sources, code / LIBRARY[1]], work / "whole", flags=["-fstack-usage"])
+        same = partial(build, target, include=[code], blobs=blobs)
+        stacks, stages_too = (CompileSpec(optimise=optimise, flags=(f,)) for f in ("-fstack-usage", "-DPLUSH_STAGES=1"))
+        whole = same([*sources, code / LIBRARY[1]], work / "whole", stacks)
         head, rows_even, rows_jittered = _whole(whole, facts)
         counts = TARGETS[target].counts
         stages: dict[str, int] = {}
         bound = None
         if counts:
-            staged = same(sources, work / "stages", defines={"PLUSH_STAGES": 1})
+            staged = same(sources, work / "stages", stages_too)
             rows = np.frombuffer(staged.run(), dtype="<i4").astype(np.int64).reshape(-1, len(STAGES))
             bound, rows = _bound(rows[-2], rows[-1], facts.step), rows[:-2]
             stages = {name: _mean(rows[:, i]) for i, name in enumerate(STAGES)}

@@ -120,36 +120,42 @@ def require(target: str, *, cc: str | None = None) -> None:
         )
 
 
+@dataclass(frozen=True)
+class CompileSpec:
+    """Compiler (None: that of the target) and options for the sources of a program and for linking it."""
+
+    cc: str | None = None
+    optimise: str = "-O2"
+    flags: tuple[str, ...] = ()
+
+
 def build(
     target: str,
     sources: Sequence[Path],
     out_dir: Path,
+    spec: CompileSpec = CompileSpec(),
     *,
     include: Iterable[Path] = (),
-    defines: Mapping[str, object] | None = None,
-    optimise: str = "-O2",
     blobs: Mapping[str, Path] | None = None,
-    cc: str | None = None,
-    flags: Sequence[str] = (),
     object_folder: Path | None = None,
 ) -> Program:
     """Build a program in ``out_dir`` from C or assembly sources, one of which defines ``main``.
 
     ``target.h`` is on the include path. Each file of ``blobs`` becomes bytes from the symbol NAME to NAME_end
-    (``extern const uint8_t NAME[], NAME_end[]``), aligned to 16 bytes. ``flags`` apply to the sources and to linking,
-    not to the runtime. ``object_folder`` keeps object files, with the compiler's reports, for later builds.
+    (``extern const uint8_t NAME[], NAME_end[]``), aligned to 16 bytes. The options do not apply to the
+    runtime. ``object_folder`` keeps object files, with the compiler's reports, for later builds.
 
     Raises:
         ToolError: when a compiler or emulator is missing.
         BuildError: when the compiler or linker fails; its ``output`` holds all messages.
     """
     machine = target_named(target)
-    require(target, cc=cc)
-    compiler = cc or machine.compiler
+    require(target, cc=spec.cc)
+    compiler = spec.cc or machine.compiler
     out_dir = Path(out_dir).resolve()
     out_dir.mkdir(parents=True, exist_ok=True)
     included = [f"-I{folder.resolve()}" for folder in (RUNTIME, *include)]
-    source_flags = [optimise, *flags, *(f"-D{name}={value}" for name, value in (defines or {}).items())]
+    source_flags = [spec.optimise, *spec.flags]
     # Otherwise the compiler replaces the loop inside memset() by a call of memset().
     runtime_flags = ["-O2", "-fno-tree-loop-distribute-patterns"] if machine.run else ["-O2"]
     parts = [(source, source_flags) for source in sources]
@@ -176,7 +182,7 @@ def build(
         inputs = [str(file) for file in objects]
         file = out_dir / f"program-{target}{'.exe' if sys.platform == 'win32' and not machine.run else ''}"
         collect = ["-Wl,--gc-sections"] if machine.run else []
-        command = [compiler, *machine.flags, optimise, *flags, *collect, *inputs, "-o", str(file), *machine.link]
+        command = [compiler, *machine.flags, *source_flags, *collect, *inputs, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
     return Program(machine, file, tuple(objects[: len(sources)]))
 

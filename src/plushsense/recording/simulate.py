@@ -35,7 +35,7 @@ from plushsense.devices.base import Counters
 from plushsense.devices.virtual.motions import AT_REST
 from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession
 from plushsense.devices.virtual.stream import PerformedGesture, ToySpec, channel_columns, received
-from plushsense.devices.virtual.world import WORLD, World, draw_person
+from plushsense.devices.virtual.world import WORLD, draw_person
 
 START_MS = 1_760_000_000_000
 """Time of the first session in ms since 1970; fixed, so that the same seed writes the same files."""
@@ -83,26 +83,26 @@ def repetitions_made(label: str, people: int, repetitions: int, seed: int) -> li
     return [repetitions - int(n) for n in np.bincount(missing % people, minlength=people)]
 
 
-def _session(who: int | None, seed: int, parts: Sequence[tuple[str, int]], layout: Layout, world: World) -> _Take:
+def _session(who: int | None, seed: int, parts: Sequence[tuple[str, int]], layout: Layout) -> _Take:
     """Simulate a session, with lost frames and the host's time; ``who`` is None for the toy at rest.
 
     ``parts`` are labels and the number of recordings of each.
     """
-    person = None if who is None else draw_person(who, seed, world)
-    session = VirtualSession(person, seed, 0, world)
+    person = None if who is None else draw_person(who, seed, WORLD)
+    session = VirtualSession(person, seed, 0, WORLD)
     episodes = [session.idle(2.0)]
     episodes += [session.perform(label, times) for label, times in parts if times]
     episodes.append(session.idle(2.0))
     number = 0 if who is None else who + 1
     order = 40 if who is None else who
     rng = np.random.default_rng([seed, number, 0xF11E])
-    frames, row_of, lost = _receive(episodes, START_MS + order * 86_400_000, True, layout, world, rng)
+    frames, row_of, lost = _receive(episodes, START_MS + order * 86_400_000, True, layout, rng)
     if who is not None:
         # Use another random generator, so that the recordings do not depend on the handling.
         handling = [e for _ in range(HANDLED) for e in (session.handle(), session.idle(2.0))]
         after = int(frames.host_ms[-1]) if frames.host_ms is not None else 0
         own_rng = np.random.default_rng([seed, number, 0xA4D])
-        more, _, more_lost = _receive(handling, after, False, layout, world, own_rng)
+        more, _, more_lost = _receive(handling, after, False, layout, own_rng)
         frames, lost = _joined(frames, more), lost + more_lost
     marks = [m for e in episodes for m in e.marks]
     cuts = [(m.label, int(row_of[m.record_start]), int(row_of[m.record_stop])) for m in marks]
@@ -110,7 +110,7 @@ def _session(who: int | None, seed: int, parts: Sequence[tuple[str, int]], layou
 
 
 def _receive(
-    episodes: Sequence[Episode], host_ms: int, first: bool, layout: Layout, world: World, rng: np.random.Generator
+    episodes: Sequence[Episode], host_ms: int, first: bool, layout: Layout, rng: np.random.Generator
 ) -> tuple[Frames, NDArray[np.int64], int]:
     """Return the received frames, for each sent row (and the end) the index among them, and the number of lost frames.
 
@@ -121,7 +121,7 @@ def _receive(
     device_ms = np.concatenate([e.device_ms for e in episodes])
     # The recorder writes the last integer of a line unchanged, which is a delay for firmware without a clock.
     written = device_ms if DEVICE_MS in layout.wire else np.concatenate([e.delay_ms for e in episodes])
-    arrives = rng.random(len(values)) >= world.lost + world.garbled
+    arrives = rng.random(len(values)) >= WORLD.lost + WORLD.garbled
     begin = host_ms + (int(rng.integers(0, 20_000_000)) if first else 10)
     # The host's clock drifts a little, and frames arrive 0 to 6 ms late.
     passed = (device_ms - device_ms[0]) * (1.0 + 4e-5 * rng.standard_normal())
@@ -156,28 +156,16 @@ def _write(folder: Path, take: _Take, layout: Layout) -> int:
     return rows
 
 
-def simulate(
-    out: str | os.PathLike[str],
-    people: int = 25,
-    seed: int = 1,
-    repetitions: int = 3,
-    progress: Progress | None = None,
-    *,
-    at_rest: int | None = None,
-    gestures: Sequence[str] | None = None,
-    layout: Layout | str = "plush-15",
-    world: World = WORLD,
-) -> SimulationResult:
-    """Write a simulated data set, by default of the size of the authors' archive.
+@dataclass(frozen=True)
+class SimulationSpec:
+    """Size of a simulated data set, by default that of the authors' archive.
 
-    These are 25 people × 17 gestures × 3, of which 25 recordings are missing, and 51 at rest: 1301.
+    This has 25 people × 17 gestures × 3, of which 25 recordings are missing, and 51 at rest: 1301.
 
-    Args:
-        out: a new or empty folder; the folders of people are ``P01`` …, that of the toy at rest ``none``.
+    Attributes:
         people, repetitions: the number of people, and of recordings of each gesture by each of them. From 25 recordings
             of a gesture on, a few are missing (`repetitions_made`).
         seed: the same seed writes the same files.
-        progress: called with (sessions done, number of sessions, folder just written).
         at_rest: number of recordings without a person; by default the share of the paper, gestures × repetitions for 25
             people, but at least 3.
         gestures: a subset of the 17, in class order.
@@ -185,12 +173,41 @@ def simulate(
 
     Raises:
         ConfigError: for a number out of range or an unknown gesture.
+    """
+
+    people: int = 25
+    seed: int = 1
+    repetitions: int = 3
+    at_rest: int | None = None
+    gestures: tuple[str, ...] = GESTURES
+    layout: Layout | str = "plush-15"
+
+    def __post_init__(self) -> None:
+        unknown = [label for label in self.gestures if label not in GESTURES]
+        if unknown:
+            raise ConfigError(f"The virtual people know no gesture '{unknown[0]}'; they know {', '.join(GESTURES)}.")
+        for name, low, high in (("people", 1, 9999), ("repetitions", 1, 1000), ("seed", 0, 2**31)):
+            if not low <= (value := getattr(self, name)) <= high:
+                raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
+
+
+def simulate(
+    out: str | os.PathLike[str], spec: SimulationSpec | None = None, progress: Progress | None = None
+) -> SimulationResult:
+    """Write a simulated data set.
+
+    Args:
+        out: a new or empty folder; the folders of people are ``P01`` …, that of the toy at rest ``none``.
+        spec: its size.
+        progress: called with (sessions done, number of sessions, folder just written).
+
+    Raises:
         DatasetError: if the folder is not empty.
     """
-    labels = tuple(gestures) if gestures is not None else GESTURES
-    _check(labels, people, repetitions, seed)
-    resting = max(3, round(len(labels) * repetitions * people / 25)) if at_rest is None else at_rest
-    resolved = layout if isinstance(layout, Layout) else load_layout(layout)
+    spec = spec or SimulationSpec()
+    people, seed, repetitions, labels = spec.people, spec.seed, spec.repetitions, spec.gestures
+    resting = max(3, round(len(labels) * repetitions * people / 25)) if spec.at_rest is None else spec.at_rest
+    layout = spec.layout if isinstance(spec.layout, Layout) else load_layout(spec.layout)
     width = max(2, len(str(people)))
     made = {label: repetitions_made(label, people, repetitions, seed) for label in labels}
     sessions: dict[str, tuple[int | None, list[tuple[str, int]]]] = {
@@ -204,25 +221,14 @@ def simulate(
         mark = f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n"
         (work / SIMULATION_MARK).write_text(mark, "utf-8")
         for done, (name, (who, parts)) in enumerate(sessions.items(), 1):
-            take = _session(who, seed, parts, resolved, world)
-            rows += _write(work / name, take, resolved)
+            take = _session(who, seed, parts, layout)
+            rows += _write(work / name, take, layout)
             recordings += len(take.cuts)
             stream_rows += len(take.frames)
             lost += take.lost
             if progress is not None:
                 progress(done, len(sessions), name)
     return SimulationResult(str(Path(out)), people, recordings, rows, stream_rows, lost, seed)
-
-
-def _check(labels: Sequence[str], people: int, repetitions: int, seed: int) -> None:
-    """Raise ConfigError for an unknown gesture or a number out of range."""
-    unknown = [label for label in labels if label not in GESTURES]
-    if unknown:
-        raise ConfigError(f"The virtual people know no gesture '{unknown[0]}'; they know {', '.join(GESTURES)}.")
-    sizes = (("people", people, 1, 9999), ("repetitions", repetitions, 1, 1000), ("seed", seed, 0, 2**31))
-    for name, value, low, high in sizes:
-        if not low <= value <= high:
-            raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
 
 
 RECORDED = "recordings"

@@ -521,14 +521,13 @@ def simulate(
         dataset: a folder in which to import the recordings as a data set; default: none.
         progress: called with ("recording" or "importing", done, total).
     """
+    from plushsense.recording.simulate import SimulationSpec
     from plushsense.recording.simulate import simulate as run
 
     report = progress or (lambda *_: None)
     done = run(
         Path(out),
-        people=people,
-        repetitions=repetitions,
-        seed=seed,
+        SimulationSpec(people=people, repetitions=repetitions, seed=seed),
         progress=lambda at, total, _: report("recording", at, total),
     )
     summary: dict[str, Any] = asdict(done)

@@ -218,9 +218,9 @@ def test_har_phone_imports_whole(real_data: Path, tmp_path: Path) -> None:
 
 
 def test_a_simulation_stays_marked(tmp_path: Path) -> None:
-    from plushsense.recording.simulate import simulate
+    from plushsense.recording.simulate import SimulationSpec, simulate
 
-    simulate(tmp_path / "virtual", people=1, repetitions=1, gestures=["Tail pull"])
+    simulate(tmp_path / "virtual", SimulationSpec(people=1, repetitions=1, gestures=("Tail pull",)))
     whole = import_recordings(tmp_path / "virtual", tmp_path / "DS", layout="plush-15")
     assert whole.dataset.head.simulated
     assert whole.rejected == ()

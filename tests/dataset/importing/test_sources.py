@@ -12,7 +12,7 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 
 ACCEL = load_layout("accel-3")
 PLUSH = load_layout("plush-15")
@@ -83,7 +83,7 @@ def test_a_data_set_is_no_source(tmp_path: Path) -> None:
 
 
 def test_a_simulation_is_known_from_above_below_and_its_head(tmp_path: Path) -> None:
-    simulate(tmp_path / "a" / "virtual", people=1, repetitions=1, at_rest=0, gestures=["Tail pull"])
+    simulate(tmp_path / "a" / "virtual", SimulationSpec(people=1, repetitions=1, at_rest=0, gestures=("Tail pull",)))
     deep = tmp_path / "a" / "virtual" / "x" / "y"
     deep.parent.mkdir()
     (tmp_path / "a" / "virtual" / "P01").rename(deep)

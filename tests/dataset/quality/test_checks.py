@@ -31,7 +31,7 @@ from plushsense.dataset.quality.checking import CHECKS, Check, CheckReport, chec
 from plushsense.dataset.quality.findings import CheckLimits, Issue
 from plushsense.dataset.quality.measurements import Examination, backward_steps, rows_at_one_time
 from plushsense.dataset.store import Dataset
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.studio.app.words import Words
 
 pytestmark = pytest.mark.apart("real-recordings")
@@ -536,7 +536,7 @@ def test_bursts_are_no_gaps(copy: Path) -> None:
 
 
 def test_simulated_sessions_raise_no_alarm(tmp_path: Path) -> None:
-    simulate(tmp_path / "src", people=3, repetitions=3, at_rest=4)
+    simulate(tmp_path / "src", SimulationSpec(people=3, repetitions=3, at_rest=4))
     dataset: Dataset = import_recordings(tmp_path / "src", tmp_path / "DS", layout="plush-15").dataset
     result = check(dataset)
     assert result.ok

@@ -22,7 +22,7 @@ from plushsense.deploy.package import ON_CHIP, emit
 from plushsense.deploy.proof import device
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.quantize import integer_model
-from plushsense.deploy.targets import TARGETS, build
+from plushsense.deploy.targets import TARGETS, CompileSpec, build
 from support.exports import bundle_of
 
 HOOKS = Path(__file__).parents[1] / "boards" / "chip" / "hooks.c"
@@ -56,7 +56,7 @@ def chip(target: str, export: Path, out: Path, *flags: str, optimise: str = "-O2
     on_chip = export / ON_CHIP
     sources = [export / "plushsense.c", export / "plush_model.c", *sorted(on_chip.glob("*.c")), HOOKS]
     flags = ("-DPLUSH_HOOKS_ELSEWHERE", *STRICT, *flags)
-    return build(target, sources, out, include=[export, on_chip], flags=flags, optimise=optimise).file
+    return build(target, sources, out, CompileSpec(None, optimise, flags), include=[export, on_chip]).file
 
 
 def verified(capsys: pytest.CaptureFixture[str], export: Path, url: str) -> tuple[int, dict[str, Any], str]:

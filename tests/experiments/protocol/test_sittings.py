@@ -18,7 +18,7 @@ from plushsense.experiments.protocol.sittings import (
     virtual_numbers,
     virtual_sittings,
 )
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.machine import FrameReader
 from plushsense.windows.clock import row_times_us
@@ -103,7 +103,7 @@ def recorded(tmp_path_factory):
     """Three virtual people as files; the second has no session stream, the third another one's."""
     work = tmp_path_factory.mktemp("recorded")
     raw = work / "raw"
-    simulate(raw, 3, 5, 2, at_rest=2, gestures=("Back stroke 1", "Tail hit 1"))
+    simulate(raw, SimulationSpec(people=3, seed=5, repetitions=2, at_rest=2, gestures=("Back stroke 1", "Tail hit 1")))
     (raw / "P02" / STREAM_NAME).unlink()
     shutil.copy(raw / "P01" / STREAM_NAME, raw / "P03" / STREAM_NAME)
     return import_recordings(raw, work / "ds", layout="plush-15", name="sessions").dataset

@@ -24,7 +24,7 @@ from plushsense.core.sentences import Message
 from plushsense.deploy.code import IMAGE, LIBRARY, MODEL
 from plushsense.deploy.golden import Counts, Vectors, counted
 from plushsense.deploy.proof.vectors import Export, RowComparison, compare
-from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, require, target_named
+from plushsense.deploy.targets import C_FOLDER, TARGETS, CompileSpec, build, missing_tools, require, target_named
 
 Progress = Callable[[int, int], None]
 Stream = tuple[Vectors, ...]  # run by one program, one after the other
@@ -245,7 +245,7 @@ def _no_sanitizers(setting: Setting) -> str:
         source = Path(work) / "nothing.c"
         source.write_text("int main(void)\n{\n    return 0;\n}\n")
         try:
-            build(setting.target, [source], Path(work), cc=setting.cc, flags=setting.flags).run()
+            build(setting.target, [source], Path(work), CompileSpec(setting.cc, flags=setting.flags)).run()
         except ToolError:
             also = " (Debian's libclang-rt-dev)" if setting.compiler == "clang" else ""
             return Message(
@@ -326,11 +326,9 @@ class _Runner:
             setting.target,
             [self.code / LIBRARY[1], harness, self.code / MODEL[1]],
             out,
+            CompileSpec(setting.cc, setting.optimise, setting.flags),
             include=[self.code],
-            optimise=setting.optimise,
             blobs={"cases": path, **({"image": self.code / IMAGE} if setting.image else {})},
-            cc=setting.cc,
-            flags=setting.flags,
             object_folder=self.objects,
         )
         try:

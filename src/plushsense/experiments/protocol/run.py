@@ -40,7 +40,7 @@ from plushsense.experiments.protocol.sittings import (
 from plushsense.jobs.study import Progress
 from plushsense.models.arch import slashed
 from plushsense.models.bundle import Bundle, known_people
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.tuning.rule_baseline import fit_rule_baseline, rule_baseline_events
 from plushsense.workflow.reporting import check_folder
@@ -53,7 +53,10 @@ def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int =
     """Tune the rule baseline on virtual people of another population; return it and a sentence on the tuning."""
     with tempfile.TemporaryDirectory() as work:
         raw, folder = Path(work) / "raw", Path(work) / "ds"
-        simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
+        simulate(
+            raw,
+            SimulationSpec(people=people, seed=(seed + _ELSEWHERE) % 2**31, repetitions=2, at_rest=0, layout=layout),
+        )
         dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
         settings = fit_rule_baseline(dataset, gestures, dataset.subjects)
     baseline = partial(rule_baseline_events, layout=layout, settings=settings)
