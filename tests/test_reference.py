@@ -25,7 +25,7 @@ REFERENCE = runpy.run_path(str(DOCS / "reference" / "generate.py"), run_name="re
 FILES, RANGE = REFERENCE["FILES"], REFERENCE["RANGE"]
 
 # Dataclasses of files that no user writes: those of the package itself, and JSON that a command writes.
-OF_THE_PACKAGE = {"Target", "SourceMutant", "Core", "PackageTable", "_ProtocolFile"}
+OF_THE_PACKAGE = {"Target", "Core", "PackageTable", "_ProtocolFile"}
 WRITTEN_BY_COMMANDS = {"Manifest", "Mark", "ModelFacts", "_Intent", "SessionHead"}
 
 # Values that other keys need, so that a key can have each of its values: None removes a key.

@@ -7,6 +7,7 @@ rounding, a clamp). The texts are in ``mutants.toml``.
 from __future__ import annotations
 
 import shutil
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,8 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plushsense.core.errors import BadInput
-from plushsense.core.toml import load_table, read_toml
 from plushsense.deploy.code import IMAGE, LIBRARY, MODEL, code_files
 from plushsense.deploy.proof.scenarios import scenarios_of
 from plushsense.deploy.proof.vectors import Export
@@ -46,9 +45,8 @@ class SourceMutant:
 @cache
 def source_mutants() -> tuple[SourceMutant, ...]:
     """The mutants of plushsense.c."""
-    path = Path(__file__).with_name("mutants.toml")
-    rows = read_toml(path, "mutants", BadInput)["mutants"]
-    return tuple(load_table(row, SourceMutant, path.name, BadInput) for row in rows)
+    text = Path(__file__).with_name("mutants.toml").read_text(encoding="utf-8")
+    return tuple(SourceMutant(**row) for row in tomllib.loads(text)["mutants"])
 
 
 @dataclass(frozen=True)
