@@ -428,7 +428,7 @@ def test_a_trial_of_some_folds_is_neither_ranked_nor_averaged(tmp_path: Path) ->
 def test_a_sweeps_folder_makes_its_page(cli: Any, tmp_path: Path) -> None:
     folder = make_sweep(tmp_path / "S", **ONE_TRIAL)
     done = cli("report", folder, "--json").json
-    assert (done["trials"], done["done"], done["mlflow"]) == (1, 1, None)
+    assert (done["trials"], done["done"]) == (1, 1)
     assert Path(done["report"]) == folder / "report.html" and Path(done["files"], "table-4.csv").is_file()
     page = tmp_path / "other.html"
     ran = cli("report", folder, "--page", page, "--title", "Mine")
@@ -441,7 +441,7 @@ def test_a_sweeps_folder_makes_its_page(cli: Any, tmp_path: Path) -> None:
     ("words", "said"),
     [
         (["{none}"], "not a folder written by sweep, and --dataset is missing"),
-        (["{tmp}/x.html", "--dataset", "{none}", "--mlflow", "{none}"], "--page and --mlflow are for a sweep"),
+        (["{tmp}/x.html", "--dataset", "{none}", "--page", "{tmp}/y.html"], "--page is for a sweep"),
         (["{sweep}", "--dataset", "{none}"], "is a sweep"),
         (["{sweep}", "--page", "{tmp}/x.docx"], "does not end in .html"),
     ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,8 +25,6 @@ from plushsense.training.spec import PRESETS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from plushsense.experiments.sweep.mlflow import MlflowResult
 
 
 @dataclass(frozen=True)
@@ -242,15 +240,11 @@ class ReportResult:
     n_files: int
     trials: int
     done: int
-    mlflow: MlflowResult | None = None
 
     @property
     def summary(self) -> list[str]:
         """What was written, in words."""
-        lines = [f"{self.n_files} tables and figures in {self.files}"]
-        if (logged := self.mlflow) is not None:
-            lines.append(f"MLflow: {logged.new} trials logged, {logged.before} were there already ({logged.uri})")
-        return lines
+        return [f"{self.n_files} tables and figures in {self.files}"]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
@@ -259,7 +253,6 @@ class ReportResult:
             "files": str(self.files),
             "trials": self.trials,
             "done": self.done,
-            "mlflow": None if self.mlflow is None else asdict(self.mlflow),
             "said": self.summary,
         }
 
@@ -269,7 +262,6 @@ def write_sweep_report(
     page: str | os.PathLike[str] | None = None,
     *,
     title: str | None = None,
-    mlflow: str | os.PathLike[str] | None = None,
 ) -> ReportResult:
     """Write the page of a sweep and, in a folder beside it, each table as CSV and each figure as PNG and SVG.
 
@@ -277,11 +269,10 @@ def write_sweep_report(
         folder: the results folder of a sweep, which may still be running.
         page: the .html file (default: ``report.html`` in the folder); an older report there is replaced.
         title: heading of the page.
-        mlflow: a folder or a tracking URI to which the trials are also logged, see `export_trials`.
 
     Raises:
         BadInput: where there is no sweep; ConfigError: where the page or its files would replace something else.
-        MissingExtraError: when polars, jinja2, matplotlib or MLflow is not installed.
+        MissingExtraError: when polars, jinja2 or matplotlib is not installed.
     """
     writing = writing_around(Path(folder))
     sweep = read_sweep(folder)
@@ -300,12 +291,7 @@ def write_sweep_report(
     with writing():
         write_files(beside, files, before)
         write_page(target, page_text)
-    logged = None
-    if mlflow is not None:
-        from plushsense.experiments.sweep.mlflow import export_trials
-
-        logged = export_trials(sweep, mlflow)
-    return ReportResult(target, beside, len(files), sweep.total, len(sweep.done), logged)
+    return ReportResult(target, beside, len(files), sweep.total, len(sweep.done))
 
 
 def render(

@@ -1,7 +1,7 @@
 """The results of trials: their columns in tables, and the choice of those whose predictions are kept.
 
 Each column of the table of trials is an entry of the registry `TRIAL_COLUMNS`, from which Parquet, CSV, ``sweep.json``,
-the page, the command line, notebooks and MLflow are made.
+the page, the command line and notebooks are made.
 """
 
 from __future__ import annotations
