@@ -244,7 +244,7 @@ def test_the_confusions_of_every_kept_network_are_files(tmp_path, monkeypatch):
     two = {"archs": ("19d1_19d2_19d4_17d8", "14d1_39d2_41d4"), "filter_sets": ((4, 6, 8, 8), (8, 12, 16, 16))}
     folder = make_sweep(tmp_path / "S", **{**ONE, **two})
     head = json.loads((folder / "sweep.json").read_text())
-    kept = [t["trial"] for t in read_sweep(folder).trials]
+    kept = [t["trial"] for t in read_sweep(folder).rows]
     head["confusions"] = {trial: [[9, 1, 0], [i, 8, 1], [0, 0, 7]] for i, trial in enumerate(kept)}
     head["predictions"] = {trial: f"predictions-{trial}.parquet" for trial in kept}
     (folder / "sweep.json").write_text(json.dumps(head))
@@ -267,7 +267,7 @@ def test_the_confusions_of_every_kept_network_are_files(tmp_path, monkeypatch):
 
 def test_a_nested_training_is_cut_at_the_trials_epochs(whole):
     sweep = read_sweep(whole)
-    trial = next(t for t in sweep.trials if t["epochs"] == 25)
+    trial = next(t for t in sweep.rows if t["epochs"] == 25)
     (history,) = sweep.histories(trial)
     assert [e["epoch"] for e in history] == list(range(1, 26))
 
@@ -412,7 +412,7 @@ def test_a_trial_of_some_folds_is_neither_ranked_nor_averaged(tmp_path: Path) ->
     sweep = read_sweep(folder)
     assert sweep.best is not None and sweep.best["accuracy"] == 0.8
     shown = [
-        *sweep_tables.best_trials(sweep).rows,
+        *sweep.best_table().rows,
         *sweep_tables.table4(sweep).rows,
         *sweep_tables.architecture_table(sweep).rows,
         *sweep_tables.pareto(sweep).rows,

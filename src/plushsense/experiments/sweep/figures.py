@@ -11,7 +11,7 @@ import numpy as np
 
 from plushsense.core.errors import need
 from plushsense.experiments.sweep.grid import CHOSEN, SECOND
-from plushsense.experiments.sweep.results import StoredSweep, finite, name_of
+from plushsense.experiments.sweep.results import SweepResult, finite, name_of
 from plushsense.experiments.sweep.tables import (
     COSTS,
     ArchitectureScores,
@@ -57,12 +57,12 @@ NAMED = 14
 """Largest number of points of a Pareto front that are labelled."""
 
 
-def about(sweep: StoredSweep) -> str:
+def about(sweep: SweepResult) -> str:
     """Return the line below a figure: data set, split, number of runs, and whether it is leaky or simulated."""
     parts = [
         f"data: {sweep.head.get('dataset') or '?'}",
         f"split {sweep.head.get('split') or '?'}" + (" (LEAKY)" if sweep.leaky else ""),
-        describe_runs(sweep.trials),
+        describe_runs(sweep.rows),
     ]
     if len(sweep.done) < sweep.total:
         parts.append(f"{len(sweep.done)} of {sweep.total} trials done")
@@ -71,14 +71,14 @@ def about(sweep: StoredSweep) -> str:
     return " · ".join(parts)
 
 
-def _figure(sweep: StoredSweep, width: float, height: float, title: str) -> Figure:
+def _figure(sweep: SweepResult, width: float, height: float, title: str) -> Figure:
     figure = figures.new_figure(width, height)
     figure.suptitle(title, fontsize=11, x=0.01, ha="left").set_parse_math(False)
     _describe_below(figure, sweep)
     return figure
 
 
-def _describe_below(figure: Figure, sweep: StoredSweep) -> None:
+def _describe_below(figure: Figure, sweep: SweepResult) -> None:
     warned = sweep.leaky or sweep.simulated
     colour, weight = ("#b3261e", "bold") if warned else ("#57606a", "normal")
     lines = textwrap.fill(about(sweep), round(_LETTERS_AN_INCH * figure.get_figwidth()), break_on_hyphens=False)
@@ -86,12 +86,12 @@ def _describe_below(figure: Figure, sweep: StoredSweep) -> None:
     text.set_parse_math(False)
 
 
-def score_label(sweep: StoredSweep, measure: str) -> str:
+def score_label(sweep: SweepResult, measure: str) -> str:
     marks = ["leaky"] * sweep.leaky + ["simulation"] * sweep.simulated
     return f"{measure}{', ' + ', '.join(marks) if marks else ''}"
 
 
-def by_architecture(sweep: StoredSweep) -> Figure:
+def by_architecture(sweep: SweepResult) -> Figure:
     """Draw the paper's Figure 7: highest and mean accuracy of each architecture, and its size with the most filters."""
     rows = _best(architectures(sweep))
     title = f"{LIKE.format(7)}: accuracy of each architecture, and its size"
@@ -111,7 +111,7 @@ def by_architecture(sweep: StoredSweep) -> Figure:
     return figure
 
 
-def by_filters(sweep: StoredSweep) -> Figure:
+def by_filters(sweep: SweepResult) -> Figure:
     """Draw the paper's Figure 8: the bars of Figure 7 in one panel for each filter set, the largest set first."""
     sets = sweep.filter_sets[::-1]
     names = [row.arch for row in _best(architectures(sweep))]
@@ -171,7 +171,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8, frameon=False)
 
 
-def size_and_accuracy(sweep: StoredSweep) -> Figure:
+def size_and_accuracy(sweep: SweepResult) -> Figure:
     """Draw the paper's Figure 9: accuracy against the number of parameters, for the networks of Table 4."""
     rows = top_rows(table4(sweep))
     figure = _figure(sweep, 9.2, 5.2, f"{LIKE.format(9)}: accuracy and size of the best of each size class")
@@ -191,7 +191,7 @@ def size_and_accuracy(sweep: StoredSweep) -> Figure:
     return figure
 
 
-def pareto(sweep: StoredSweep, cost: str) -> Figure:
+def pareto(sweep: SweepResult, cost: str) -> Figure:
     """Draw the best macro-F1 of each network against a cost, with the Pareto front as a line with labelled points."""
     points = pareto_points(sweep, cost)
     label = COSTS[cost]
@@ -236,7 +236,7 @@ def _class_legend(axes: Axes) -> None:
     axes.legend(title="filters", fontsize=8, title_fontsize=8, **place)
 
 
-def schedules(sweep: StoredSweep) -> Figure:
+def schedules(sweep: SweepResult) -> Figure:
     """Draw accuracy and macro-F1 by epochs and batch: means over the networks, with standard deviations as bars."""
     rows = effect(sweep).rows
     lengths, sizes = epochs(sweep), batches(sweep)
@@ -281,7 +281,7 @@ def schedules(sweep: StoredSweep) -> Figure:
     return figure
 
 
-def curves(sweep: StoredSweep, trial: Row) -> Figure | None:
+def curves(sweep: SweepResult, trial: Row) -> Figure | None:
     """Draw the learning curves of a trial in training and validation; None if none were stored."""
     histories = sweep.histories(trial)
     if not histories:
@@ -291,7 +291,7 @@ def curves(sweep: StoredSweep, trial: Row) -> Figure | None:
     return figure
 
 
-def confusion(sweep: StoredSweep, trial: Row) -> Figure | None:
+def confusion(sweep: SweepResult, trial: Row) -> Figure | None:
     """Draw a confusion matrix as in the paper's Figures 10 and 11, with classes sorted and framed by affect."""
     counts = sweep.confusion(str(trial["trial"]))
     if counts is None:
@@ -328,7 +328,7 @@ def affect_order(affects: Sequence[str]) -> list[int]:
     return sorted(range(len(affects)), key=lambda i: (ranks[affects[i]], i))
 
 
-def _by_class(sweep: StoredSweep) -> list[tuple[str, tuple[str, str]]]:
+def _by_class(sweep: SweepResult) -> list[tuple[str, tuple[str, str]]]:
     """Return each filter set with its marker and colour."""
     return [(s, CLASSES[i % len(CLASSES)]) for i, s in enumerate(sweep.filter_sets)]
 

@@ -151,7 +151,7 @@ def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
             warn(
                 Message(
                     "{n} of the {of} classes are gestures that fewer than 90 % of the people made ({gestures}): the "
-                    "tested person may be the only one with a class; leave these classes out with --classes shared",
+                    "tested person may be the only one with a class; leave these classes out with --set classes=shared",
                     n=len(rare),
                     of=len(cut.gestures),
                     gestures=sorted(rare),

@@ -15,7 +15,7 @@ from plushsense.experiments.sweep import figures as draw
 from plushsense.experiments.sweep import tables
 from plushsense.experiments.sweep.folder import SUMMARY
 from plushsense.experiments.sweep.grid import GRID_TRAINING
-from plushsense.experiments.sweep.results import StoredSweep, file_name_of, name_of, read_sweep
+from plushsense.experiments.sweep.results import SweepResult, file_name_of, name_of, read_sweep
 from plushsense.reports import wording
 from plushsense.reports.figures import png, svg, svg_uri
 from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
@@ -53,7 +53,7 @@ class Section:
     more_drawings: tuple[Drawing, ...] = ()
 
 
-def sections_of(sweep: StoredSweep) -> Iterator[Section]:
+def sections_of(sweep: SweepResult) -> Iterator[Section]:
     """Yield the sections of the report in the paper's order; without any finished trial, only those without scores."""
     if not sweep.done:
         yield Section("best", "The best trials", dropped=("No trial is done yet: there is no score to show.",))
@@ -61,7 +61,7 @@ def sections_of(sweep: StoredSweep) -> Iterator[Section]:
         return
     best = sweep.best
     assert best is not None
-    yield Section("best", "The best trials", (tables.best_trials(sweep),))
+    yield Section("best", "The best trials", (sweep.best_table(),))
     yield _overview(sweep)
     yield _parameters(sweep)
     yield _by_filters(sweep)
@@ -73,11 +73,11 @@ def sections_of(sweep: StoredSweep) -> Iterator[Section]:
     yield _fronts(sweep)
 
 
-def _parameters(sweep: StoredSweep) -> Section:
+def _parameters(sweep: SweepResult) -> Section:
     return Section("table-3", "Parameters (the paper's Table 3)", (tables.table3(sweep),), scores=False)
 
 
-def _overview(sweep: StoredSweep) -> Section:
+def _overview(sweep: SweepResult) -> Section:
     rows = tables.architectures(sweep)
     best = max(rows, key=lambda row: row.highest or 0.0)
     alt = (
@@ -89,7 +89,7 @@ def _overview(sweep: StoredSweep) -> Section:
     return Section("figure-7", title, (tables.architecture_table(sweep),), (drawing,), _only_best(len(rows)))
 
 
-def _by_filters(sweep: StoredSweep) -> Section:
+def _by_filters(sweep: SweepResult) -> Section:
     title = "Accuracy by filter set (the paper's Figure 8)"
     if len(sweep.filter_sets) < 2:
         return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
@@ -107,7 +107,7 @@ def _only_best(architectures: int) -> tuple[str, ...]:
     return (f"Drawn are the best {draw.BARS} of {architectures} architectures; the CSV has all.",)
 
 
-def _top(sweep: StoredSweep) -> Section:
+def _top(sweep: SweepResult) -> Section:
     table = tables.table4(sweep)
     title = "The best of each size class (the paper's Table 4 and Figure 9)"
     if len(table.rows) < 2:
@@ -118,7 +118,7 @@ def _top(sweep: StoredSweep) -> Section:
     return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
 
 
-def _effect(sweep: StoredSweep) -> Section:
+def _effect(sweep: SweepResult) -> Section:
     title, table = "Effect of epochs and batch", tables.effect(sweep)
     if len(tables.epochs(sweep)) * len(tables.batches(sweep)) < 2:
         dropped = ("All trials have the same epochs and batch: there is nothing to compare.",)
@@ -130,7 +130,7 @@ def _effect(sweep: StoredSweep) -> Section:
     return Section("effect", title, (table,), (Drawing("effect", draw.schedules(sweep), alt),))
 
 
-def _looked_at(sweep: StoredSweep, best: Row) -> list[Row]:
+def _looked_at(sweep: SweepResult, best: Row) -> list[Row]:
     """Return the trials to show with confusions and curves: the paper's two networks if in the grid, and the best."""
     candidates = [*(sweep.best_of(*network) for network in draw.PAPER_CONFUSIONS), best]
     return list({t["trial"]: t for t in candidates if t}.values())
@@ -140,7 +140,7 @@ _MATRICES = 12
 """Largest number of confusion matrices on the page; all are files."""
 
 
-def _confusions(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
+def _confusions(sweep: SweepResult, trials: Sequence[Row]) -> Section:
     title = "Confusions (the paper's Figures 10 and 11)"
     if len(sweep.labels) < 2:
         return Section("confusion", title, dropped=("The sweep names no classes: there is nothing to confuse.",))
@@ -173,7 +173,7 @@ def _confusions(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
     )
 
 
-def confusion_words(sweep: StoredSweep, trial: Row) -> str:
+def confusion_words(sweep: SweepResult, trial: Row) -> str:
     """Describe a confusion matrix in words: shares that are right, wrong within an affect, and wrong across affects."""
     counts = np.asarray(sweep.confusion(str(trial["trial"])), dtype=np.int64)
     total, right = int(counts.sum()), int(np.trace(counts))
@@ -194,7 +194,7 @@ def confusion_words(sweep: StoredSweep, trial: Row) -> str:
     return description + (f". {draw.LIKE.format(number)}." if number else ".")
 
 
-def _curves(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
+def _curves(sweep: SweepResult, trials: Sequence[Row]) -> Section:
     drawings, dropped = [], []
     for trial in trials:
         figure = draw.curves(sweep, trial)
@@ -206,7 +206,7 @@ def _curves(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
     return Section("curves", "Learning curves", drawings=tuple(drawings), dropped=tuple(dropped))
 
 
-def _fronts(sweep: StoredSweep) -> Section:
+def _fronts(sweep: SweepResult) -> Section:
     drawings, dropped = [], []
     for cost, label in tables.COSTS.items():
         points = tables.pareto_points(sweep, cost)
@@ -276,7 +276,7 @@ def write_sweep_report(
     """
     writing = writing_around(Path(folder))
     sweep = read_sweep(folder)
-    target = check_page_path(Path(page) if page is not None else sweep.folder / PAGE)
+    target = check_page_path(Path(page) if page is not None else sweep.out / PAGE)
     beside = target.parent / (FILES if target.name == PAGE else f"{target.stem}-files")
     before = earlier_files(beside)
     sections = list(sections_of(sweep))
@@ -295,7 +295,7 @@ def write_sweep_report(
 
 
 def render(
-    sweep: StoredSweep,
+    sweep: SweepResult,
     sections: Sequence[Section],
     pictures: Mapping[str, bytes],
     *,
@@ -310,14 +310,14 @@ def render(
         leaky=sweep.leaky,
         done=len(sweep.done),
         total=sweep.total,
-        over=wording.describe_runs(sweep.trials),
+        over=wording.describe_runs(sweep.rows),
         about=about_rows(sweep),
         sections=[_template_values(sweep, section, pictures) for section in sections],
         files=files,
     )
 
 
-def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
+def about_rows(sweep: SweepResult) -> list[tuple[str, str]]:
     """Return grid, data and split as (name, value) pairs."""
     head = sweep.head
     how, who = wording.describe_split(str(head.get("split")))
@@ -328,7 +328,7 @@ def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
     )
     waiting = sweep.total - len(sweep.done)
     seconds = head.get("seconds")
-    tested = {(r.get("seed"), r.get("fold")): int(r["test_windows"]) for r in sweep.runs if r.get("test_windows")}
+    tested = {(r.get("seed"), r.get("fold")): int(r["test_windows"]) for r in sweep.run_rows if r.get("test_windows")}
     scored = sum(tested.values()) // max(1, len({seed for seed, _ in tested}))
     return [
         ("Data set", text(head.get("dataset"))),
@@ -340,9 +340,9 @@ def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
         ("Context", wording.CONTEXT_WORDS.get(str(head.get("context")), text(head.get("context")))),
         ("Training preset", text(head.get("preset"))),
         *training_settings(sweep),
-        ("Padding", ", ".join(sorted({str(t.get("padding")) for t in sweep.trials})) or DASH),
+        ("Padding", ", ".join(sorted({str(t.get("padding")) for t in sweep.rows})) or DASH),
         ("Grid", f"{grid} (the paper's has {tables.PAPER_TRIALS} trials)"),
-        ("Seeds and folds", wording.describe_runs(sweep.trials)),
+        ("Seeds and folds", wording.describe_runs(sweep.rows)),
         (
             "Trials",
             f"{len(sweep.done)} of {sweep.total} done"
@@ -356,7 +356,7 @@ def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
     ]
 
 
-def training_settings(sweep: StoredSweep) -> list[tuple[str, str]]:
+def training_settings(sweep: SweepResult) -> list[tuple[str, str]]:
     """Return the settings of the networks and their training, with those of the preset filled in."""
     grid = sweep.head.get("grid") or {}
     preset = PRESETS.get(str(sweep.head.get("preset")))
@@ -377,7 +377,7 @@ def training_settings(sweep: StoredSweep) -> list[tuple[str, str]]:
     ]
 
 
-def _template_values(sweep: StoredSweep, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
+def _template_values(sweep: SweepResult, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
     return {
         "key": section.key,
         "title": section.title,
@@ -397,7 +397,7 @@ def _template_values(sweep: StoredSweep, section: Section, pictures: Mapping[str
 
 
 def _contents(
-    sweep: StoredSweep, sections: Sequence[Section], pictures: Mapping[str, bytes]
+    sweep: SweepResult, sections: Sequence[Section], pictures: Mapping[str, bytes]
 ) -> Iterator[tuple[str, bytes]]:
     """Yield the name and content of each file; every table includes the data and split of its scores."""
     source = {"dataset": sweep.head.get("dataset"), "split": sweep.head.get("split")}

@@ -7,17 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from plushsense.experiments.sweep.folder import BEST
 from plushsense.experiments.sweep.results import (
-    StoredSweep,
     SweepNetwork,
+    SweepResult,
     file_name_of,
     finite,
     name_of,
     schedule,
     spread,
 )
-from plushsense.experiments.sweep.trials import listed_columns
 from plushsense.models.arch import PAPER_FILTERS, TABLE3, TABLE3_MISPRINT, Arch, slashed
 from plushsense.reports.table import Column, Row, Table, count
 from plushsense.scoring.metrics import accuracy_complexity_ratio, column_metrics, pareto_front
@@ -127,7 +125,7 @@ class ArchitectureScores:
     parameters: int
 
 
-def architectures(sweep: StoredSweep, filter_set: str | None = None) -> list[ArchitectureScores]:
+def architectures(sweep: SweepResult, filter_set: str | None = None) -> list[ArchitectureScores]:
     """Return the accuracy of each architecture, over one or all filter sets."""
     rows = []
     for label in dict.fromkeys(n.label for n in sweep.networks):
@@ -142,7 +140,7 @@ def architectures(sweep: StoredSweep, filter_set: str | None = None) -> list[Arc
     return rows
 
 
-def architecture_table(sweep: StoredSweep) -> Table:
+def architecture_table(sweep: SweepResult) -> Table:
     """Return the numbers of Figures 7 and 8."""
     parts: list[str | None] = [None, *(sweep.filter_sets if len(sweep.filter_sets) > 1 else [])]
     columns = (
@@ -160,24 +158,24 @@ def architecture_table(sweep: StoredSweep) -> Table:
     return Table(name, "Each architecture over all its trials", columns, rows, (), limit)
 
 
-def batches(sweep: StoredSweep) -> list[str]:
+def batches(sweep: SweepResult) -> list[str]:
     """Return the batches as given in the grid, small to large, "full" last."""
-    asked = {str(t["batch_asked"]) for t in sweep.trials}
+    asked = {str(t["batch_asked"]) for t in sweep.rows}
     return sorted(asked, key=lambda b: (not b.isdecimal(), int(b) if b.isdecimal() else 0))
 
 
-def epochs(sweep: StoredSweep) -> list[int]:
-    return sorted({int(t["epochs"]) for t in sweep.trials})
+def epochs(sweep: SweepResult) -> list[int]:
+    return sorted({int(t["epochs"]) for t in sweep.rows})
 
 
-def compared(sweep: StoredSweep) -> tuple[list[SweepNetwork], bool]:
+def compared(sweep: SweepResult) -> tuple[list[SweepNetwork], bool]:
     """Return the networks with a score for every schedule and True, or if there are none, those with any and False."""
-    every = {(int(t["epochs"]), str(t["batch_asked"])) for t in sweep.trials}
+    every = {(int(t["epochs"]), str(t["batch_asked"])) for t in sweep.rows}
     whole = [n for n in sweep.networks if {(int(t["epochs"]), str(t["batch_asked"])) for t in n.done} == every]
     return (whole, True) if whole else ([n for n in sweep.networks if n.done], False)
 
 
-def effect(sweep: StoredSweep) -> Table:
+def effect(sweep: SweepResult) -> Table:
     """Return mean and standard deviation over the networks for each number of epochs and batch."""
     networks, whole = compared(sweep)
     rows = []
@@ -242,7 +240,7 @@ class ParetoPoint:
     front: bool
 
 
-def pareto_points(sweep: StoredSweep, cost: str) -> list[ParetoPoint]:
+def pareto_points(sweep: SweepResult, cost: str) -> list[ParetoPoint]:
     """Return the networks that have a score, by ascending cost (a key of `COSTS`)."""
     best = [(n, t) for n in sweep.networks if (t := n.best("macro_f1")) and finite(t.get(cost)) and t[cost] > 0]
     front = pareto_front([(float(t["macro_f1"]), t[cost]) for _, t in best])
@@ -255,7 +253,7 @@ def pareto_points(sweep: StoredSweep, cost: str) -> list[ParetoPoint]:
     return sorted(points, key=lambda point: (point.value, -point.macro_f1))
 
 
-def pareto(sweep: StoredSweep) -> Table:
+def pareto(sweep: SweepResult) -> Table:
     """Return the networks on the Pareto fronts of macro-F1 and each of `COSTS`."""
     rows = [{**asdict(p), "cost": name} for cost, name in COSTS.items() for p in pareto_points(sweep, cost) if p.front]
     columns = (
@@ -278,15 +276,7 @@ TOP = 3
 """Number of networks of each size class (a filter set) in Table 4, as in the paper."""
 
 
-def best_trials(sweep: StoredSweep) -> Table:
-    """Return the `BEST` trials by accuracy, the highest first; of equal ones the smallest network first."""
-    ranked = sorted(sweep.done, key=lambda t: (-float(t["accuracy"]), int(t["parameters"])))[:BEST]
-    columns = tuple(c for c in listed_columns() if any(t.get(c.key) is not None for t in ranked))
-    notes = ["Ranked on the test part itself, as the paper did: the first of many is flattered by luck."]
-    return Table("best-trials", "The best trials", columns, tuple(ranked), tuple(notes))
-
-
-def table3(sweep: StoredSweep) -> Table:
+def table3(sweep: SweepResult) -> Table:
     """Return the numbers of parameters by architecture and filter set, beside those of the paper's Table 3."""
     rows: dict[str, dict[str, Any]] = {}
     met, near, off, other = 0, 0, list[str](), False
@@ -342,7 +332,7 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
     return words
 
 
-def table4(sweep: StoredSweep) -> Table:
+def table4(sweep: SweepResult) -> Table:
     """Return the best networks of each size class and all that the paper prints in Table 4, beside its figures."""
     rows = []
     for filter_set in sweep.filter_sets:
@@ -434,7 +424,7 @@ def _table4_row(network: SweepNetwork, rank: int) -> dict[str, Any]:
     }
 
 
-def confusion_table(sweep: StoredSweep, trial: Row, name: str) -> Table:
+def confusion_table(sweep: SweepResult, trial: Row, name: str) -> Table:
     """Return the confusion matrix of a trial, which must be stored: a row for each true class, in windows."""
     columns = (Column("truth", "Truth"), *(Column(f"read as {label}", label, "count") for label in sweep.labels))
     rows = tuple(
@@ -444,7 +434,7 @@ def confusion_table(sweep: StoredSweep, trial: Row, name: str) -> Table:
     return Table(name, f"Confusions of {name_of(trial)}", columns, rows)
 
 
-def per_class(sweep: StoredSweep, trial: Row) -> Table | None:
+def per_class(sweep: SweepResult, trial: Row) -> Table | None:
     """Return recall, precision and F1 of each gesture in one trial; None if they were not stored."""
     stored = (sweep.head.get("per_class") or {}).get(trial["trial"])
     if not isinstance(stored, Sequence) or not all(isinstance(row, Mapping) for row in stored) or not stored:
