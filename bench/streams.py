@@ -34,7 +34,6 @@ class Row:
 
     title: str
     system: str = ANYWHERE
-    pool_s: float | None = None
     anywhere: dict[str, float] = field(default_factory=dict)
 
 
@@ -44,8 +43,6 @@ ROWS = {
     "smoothed": Row("anywhere, smoothed argmax", system="anywhere-smoothed"),
     "easy": Row("anywhere, hysteresis"),
     "hard": Row("anywhere, hysteresis, hard negatives", anywhere={"hard_share": 0.15}),
-    "pool-0.8": Row("anywhere, hysteresis, pool 0.8 s", pool_s=0.8),
-    "pool-0.5": Row("anywhere, hysteresis, pool 0.5 s", pool_s=0.5),
 }
 
 
@@ -82,7 +79,7 @@ def benchmark(dataset: Dataset, row: Row, seed: int, workers: int) -> dict[str, 
     config = replace(config, evaluation=replace(config.evaluation, workers=workers))
     # The reference is needed for the interpolation at equal recall.
     systems = list(dict.fromkeys(["smoothed", row.system]))
-    return stream_benchmark(dataset, config, BenchmarkSpec(systems=systems, anywhere_pool_s=row.pool_s))
+    return stream_benchmark(dataset, config, BenchmarkSpec(systems=systems))
 
 
 def figures(row: Row, result: dict[str, Any]) -> dict[str, Any]:

@@ -33,8 +33,8 @@ def run_stream_eval(args: argparse.Namespace) -> int:
         raise ConfigError("--events belongs to --model: leave it out.")
     if args.split is not None:
         return _run_split(args)
-    if args.out or args.systems or args.anywhere_pool is not None:
-        raise ConfigError("--out, --systems and --anywhere-pool belong to --split: leave them out, or give --split.")
+    if args.out or args.systems:
+        raise ConfigError("--out and --systems belong to --split: leave them out, or give --split.")
     scored = _score_model(args) if args.model is not None else _score_predictions(args)
     result = scored.to_json()
     emit(args, result, _format_scores(result))
@@ -84,7 +84,6 @@ def _run_split(args: argparse.Namespace) -> int:
             None if args.systems is None else listed(args.systems),
             args.late,
             args.labels == "use",
-            args.anywhere_pool,
         ),
         out=args.out,
         overwrite=args.force,
@@ -222,8 +221,8 @@ def run_protocol(args: argparse.Namespace) -> int:
 
 
 def _protocol_lines(result: ProtocolResult) -> list[str]:
-    """Format the outcome of the protocol as text: the table, the aims and the notes."""
-    from plushsense.experiments.protocol.report import SIMULATION, aim_table, between_table, group_table
+    """Format the outcome of the protocol as text: the table and the notes."""
+    from plushsense.experiments.protocol.report import SIMULATION, between_table, group_table
 
     out = [result.heading, *([SIMULATION] if result.simulated else [])]
     out += [f"{name}: {value}" for name, value in result.about]
@@ -233,7 +232,5 @@ def _protocol_lines(result: ProtocolResult) -> list[str]:
         f"{row['negative']} negative events, {row['none']} without affect: {row['reactions']} an hour"
         for row in between_table(result).rows
     ]
-    if result.aims:
-        out += ["", *(f"{row['met']}: {row['aim']}: {row['measured']}" for row in aim_table(result).rows)]
     out += ["", *result.said]
     return [*out, f"written: {result.files[0]}"] if result.files else out

@@ -17,13 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest, python_warning
-from plushsense.core.files import temporary_folder
 from plushsense.dataset.files import CACHE
-from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.index import as_dataset
-from plushsense.dataset.store import HEAD, Dataset
+from plushsense.dataset.store import Dataset
 from plushsense.deploy.quantize import calibration
 from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
+from plushsense.experiments.recordings import opened
 from plushsense.jobs.journal import Result
 from plushsense.jobs.pool import JobsSpec, Report
 from plushsense.jobs.study import Progress, StudyPart, StudyResults, run_study
@@ -229,8 +227,7 @@ def adapt(
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     if (before := given.adapted_to) is not None:
         warn(f"the bundle is adapted to {before}: it is adapted again from its original")
-    with temporary_folder() as place:
-        dataset = _dataset(recordings, given, place)
+    with opened(recordings, given.layout, given.gestures) as dataset:
         person = _person(dataset, subject)
         dataset = dataset.with_inputs(given.layout).with_gestures(given.gestures)
         _same_layout(given, dataset)
@@ -238,37 +235,25 @@ def adapt(
         own, left_out = _recordings_of(dataset, person, given, warn)
         windows = windows_for(own, given.arch, whole_gestures(given.windowing), given.gestures, warn)
         times = {r.id: r.epoch_ms for r in own.recordings}
-    adapting, test = windows, None
-    if use is not None:
-        everything = set(windows.recording.tolist())
-        adapting, test = _divide(windows, next(_choices(windows, times, use), everything))
-        if not len(test):
-            raise BadInput(
-                f"No recording of {person} is left to test on: {use} of each gesture are used to adapt; use fewer."
-            )
-    done = personalise(given, adapting.integers, adapting.y, adapting.recording, subject=person, spec=spec)
-    for label in done.without:
-        warn(f"{label}: fewer than {spec.least} recordings, so the network recognises it as before")
-    tested = None
-    if test is not None:
-        original = restore_original(given) if before is not None else given
-        predictors = (_predictor(original), _predictor(done.bundle if done.accepted else original))
-        one, other = (judge(predict(test), test.y, test.recording).scores for predict in predictors)
-        tested = (one, other)
-    if not dataset.path.is_relative_to(place):  # the one made of a folder is gone by now
+        adapting, test = windows, None
+        if use is not None:
+            everything = set(windows.recording.tolist())
+            adapting, test = _divide(windows, next(_choices(windows, times, use), everything))
+            if not len(test):
+                raise BadInput(
+                    f"No recording of {person} is left to test on: {use} of each gesture are used to adapt; use fewer."
+                )
+        done = personalise(given, adapting.integers, adapting.y, adapting.recording, subject=person, spec=spec)
+        for label in done.without:
+            warn(f"{label}: fewer than {spec.least} recordings, so the network recognises it as before")
+        tested = None
+        if test is not None:
+            original = restore_original(given) if before is not None else given
+            predictors = (_predictor(original), _predictor(done.bundle if done.accepted else original))
+            one, other = (judge(predict(test), test.y, test.recording).scores for predict in predictors)
+            tested = (one, other)
         dataset.generation.check()
     return Adapted(done, person, use, tested, left_out, dataset.head.simulated)
-
-
-def _dataset(recordings: Dataset | str | os.PathLike[str], bundle: Bundle, place: Path) -> Dataset:
-    """Return the data set, or one made of a recorder's folder in the folder ``place``."""
-    if isinstance(recordings, Dataset) or (Path(recordings) / HEAD).is_file():
-        return as_dataset(recordings)
-    if not Path(recordings).exists():
-        raise DatasetError(f"There is no folder '{recordings}': give a data set, or a person's folder of recordings.")
-    return import_recordings(
-        Path(recordings), place / "DS", layout=bundle.layout, gestures=bundle.gestures, adopt_proposals=False
-    ).dataset
 
 
 def _person(dataset: Dataset, subject: str | None) -> str:

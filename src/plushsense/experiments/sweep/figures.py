@@ -11,14 +11,11 @@ import numpy as np
 
 from plushsense.core.errors import need
 from plushsense.experiments.sweep.grid import CHOSEN, SECOND
-from plushsense.experiments.sweep.results import SweepResult, finite, name_of
+from plushsense.experiments.sweep.results import SweepResult, name_of
 from plushsense.experiments.sweep.tables import (
     COSTS,
     ArchitectureScores,
     architectures,
-    batches,
-    effect,
-    epochs,
     pareto_points,
     table4,
     top_rows,
@@ -43,7 +40,6 @@ CLASSES = (
     ("X", "#f0e442"),
     ("h", "#7f7f7f"),
 )
-_STYLES = ("-", "--", ":", "-.")
 BARS = 30
 """Largest number of architectures in a bar chart; of more only the best are drawn, so that it stays legible."""
 _BAR_WITH_VALUE = 10.0
@@ -234,51 +230,6 @@ def pareto(sweep: SweepResult, cost: str) -> Figure:
 def _class_legend(axes: Axes) -> None:
     place: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "frameon": False}
     axes.legend(title="filters", fontsize=8, title_fontsize=8, **place)
-
-
-def schedules(sweep: SweepResult) -> Figure:
-    """Draw accuracy and macro-F1 by epochs and batch: means over the networks, with standard deviations as bars."""
-    rows = effect(sweep).rows
-    lengths, sizes = epochs(sweep), batches(sweep)
-    # The axis shows the epochs, with a line for each batch; if only the batch varies, the axis shows the batch.
-    along, lines = (lengths, sizes) if len(lengths) > 1 else (sizes, lengths)
-    keys = ("epochs", "batch_asked") if len(lengths) > 1 else ("batch_asked", "epochs")
-    axis, each = ("Epochs", "batch") if len(lengths) > 1 else ("Batch", "epochs")
-    figure = _figure(sweep, 9.2, 4.0, "Effect of epochs and batch: means over the networks, bars ± 1 sd")
-    for axes, measure, label, scale in zip(
-        figure.subplots(1, 2),
-        ("accuracy", "macro_f1"),
-        ("Mean accuracy (% of test windows)", "Mean macro-F1 (0 to 1)"),
-        (100.0, 1.0),
-        strict=True,
-    ):
-        for i, line in enumerate(lines):
-            marker, colour = CLASSES[i % len(CLASSES)]
-            mine = {r[keys[0]]: r for r in rows if r[keys[1]] == line}
-            at = [k for k, value in enumerate(along) if value in mine and finite(mine[value][measure])]
-            mean = [scale * mine[along[k]][measure] for k in at]
-            sd = [scale * (mine[along[k]][f"{measure}_sd"] or 0.0) for k in at]
-            shift = (i - (len(lines) - 1) / 2) * 0.09
-            axes.errorbar(
-                np.array(at) + shift,
-                mean,
-                yerr=sd,
-                marker=marker,
-                linestyle=_STYLES[i % len(_STYLES)],
-                color=colour,
-                markeredgecolor="black",
-                capsize=3,
-                label=f"{each} {line}",
-            )
-        axes.set_xticks(range(len(along)), [str(value) for value in along])
-        axes.set_xlim(-0.5, len(along) - 0.5)
-        axes.set_xlabel(axis, fontsize=9)
-        axes.set_ylabel(score_label(sweep, label), fontsize=9)
-        axes.tick_params(labelsize=8)
-        axes.grid(axis="y", color="#dddddd", linewidth=0.5)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(fontsize=8, frameon=False)
-    return figure
 
 
 def curves(sweep: SweepResult, trial: Row) -> Figure | None:

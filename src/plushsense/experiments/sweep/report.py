@@ -40,7 +40,7 @@ class Drawing:
 class Section:
     """A section of the page: tables, figures, and in ``dropped`` sentences on what is left out, and why.
 
-    ``files`` and ``more_drawings`` are written as files only.
+    ``files`` are tables that are written as files only.
     """
 
     key: str
@@ -50,7 +50,6 @@ class Section:
     dropped: tuple[str, ...] = ()
     scores: bool = True
     files: tuple[Table, ...] = ()
-    more_drawings: tuple[Drawing, ...] = ()
 
 
 def sections_of(sweep: SweepResult) -> Iterator[Section]:
@@ -120,24 +119,15 @@ def _top(sweep: SweepResult) -> Section:
 
 def _effect(sweep: SweepResult) -> Section:
     title, table = "Effect of epochs and batch", tables.effect(sweep)
-    if len(tables.epochs(sweep)) * len(tables.batches(sweep)) < 2:
-        dropped = ("All trials have the same epochs and batch: there is nothing to compare.",)
-        return Section("effect", title, dropped=dropped)
     if len(table.rows) < 2:
-        dropped = ("One schedule only is scored yet: there is nothing to compare.",)
-        return Section("effect", title, (table,), dropped=dropped)
-    alt = "Lines: mean accuracy and macro-F1 over the networks by epochs and batch; the table has the numbers."
-    return Section("effect", title, (table,), (Drawing("effect", draw.schedules(sweep), alt),))
+        return Section("effect", title, dropped=("One schedule only is scored: there is nothing to compare.",))
+    return Section("effect", title, (table,))
 
 
 def _looked_at(sweep: SweepResult, best: Row) -> list[Row]:
     """Return the trials to show with confusions and curves: the paper's two networks if in the grid, and the best."""
     candidates = [*(sweep.best_of(*network) for network in draw.PAPER_CONFUSIONS), best]
     return list({t["trial"]: t for t in candidates if t}.values())
-
-
-_MATRICES = 12
-"""Largest number of confusion matrices on the page; all are files."""
 
 
 def _confusions(sweep: SweepResult, trials: Sequence[Row]) -> Section:
@@ -160,17 +150,7 @@ def _confusions(sweep: SweepResult, trials: Sequence[Row]) -> Section:
         counts.append(tables.confusion_table(sweep, trial, name))
     if by_gesture and set(sweep.affects) == {"none"}:
         dropped.append("The gestures of this data set have no affect: there are no blocks.")
-    if more := len(drawings[_MATRICES:]):
-        dropped.append(f"{more} more confusion matrices are in the files only, with their tables.")
-    return Section(
-        "confusion",
-        title,
-        tuple(by_gesture[:_MATRICES]),
-        tuple(drawings[:_MATRICES]),
-        tuple(dropped),
-        files=(*counts, *by_gesture[_MATRICES:]),
-        more_drawings=tuple(drawings[_MATRICES:]),
-    )
+    return Section("confusion", title, tuple(by_gesture), tuple(drawings), tuple(dropped), files=tuple(counts))
 
 
 def confusion_words(sweep: SweepResult, trial: Row) -> str:
@@ -280,7 +260,7 @@ def write_sweep_report(
     beside = target.parent / (FILES if target.name == PAGE else f"{target.stem}-files")
     before = earlier_files(beside)
     sections = list(sections_of(sweep))
-    drawings = [d for section in sections for d in (*section.drawings, *section.more_drawings)]
+    drawings = [d for section in sections for d in section.drawings]
     for d in drawings:
         # Compute the layout once for PNG and SVG.
         d.figure.draw_without_rendering()
@@ -405,6 +385,6 @@ def _contents(
     for section in sections:
         for table in (*section.tables, *section.files):
             yield f"{table.name}.csv", table.csv(source).encode()
-        for d in (*section.drawings, *section.more_drawings):
+        for d in section.drawings:
             yield f"{d.name}.png", png(d.figure, dpi=_DPI)
             yield f"{d.name}.svg", pictures[d.name]
