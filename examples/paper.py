@@ -184,7 +184,7 @@ class Paper:
                 Row(
                     "search",
                     f"{symbol} {trial['filters']}, accuracy ({about})",
-                    f"{100 * TABLE4[symbol, trial['filters']].highest:.1f} %",
+                    f"{100 * TABLE4[symbol, trial['filters']].accuracy:.1f} %",
                     f"{100 * trial['accuracy']:.1f} %{spread}",
                     f"{seeds_text(self.seeds)}, {tested} windows",
                 )

@@ -16,7 +16,7 @@ from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.experiments.protocol.score import ProtocolResult
-    from plushsense.experiments.streams.run import PredictionsResult, StreamEvalResult
+    from plushsense.experiments.streams.run import BenchmarkResult, PredictionsResult, StreamEvalResult
 
 
 def run_stream_eval(args: argparse.Namespace) -> int:
@@ -35,39 +35,19 @@ def run_stream_eval(args: argparse.Namespace) -> int:
         return _run_split(args)
     if args.out or args.systems:
         raise ConfigError("--out and --systems belong to --split: leave them out, or give --split.")
-    scored = _score_model(args) if args.model is not None else _score_predictions(args)
+    from plushsense.experiments.streams.run import score_predictions, stream_eval
+
+    people: dict[str, Any] = {"subjects": None if args.subjects is None else listed(args.subjects)}
+    people |= {"late_s": args.late, "labels": args.labels == "use", "warn": warn}
+    scored: PredictionsResult | StreamEvalResult
+    if args.model is not None:
+        scored = stream_eval(args.source, args.model, events=args.events, **people)
+    else:
+        classes, threshold = settings(args).evaluation.classes, args.threshold or 0.0
+        scored = score_predictions(args.source, args.predictions, classes=classes, threshold=threshold, **people)
     result = scored.to_json()
     emit(args, result, _format_scores(result))
     return 0
-
-
-def _score_model(args: argparse.Namespace) -> StreamEvalResult:
-    from plushsense.experiments.streams.run import stream_eval
-
-    return stream_eval(
-        args.source,
-        args.model,
-        subjects=None if args.subjects is None else listed(args.subjects),
-        late_s=args.late,
-        events=args.events,
-        labels=args.labels == "use",
-        warn=warn,
-    )
-
-
-def _score_predictions(args: argparse.Namespace) -> PredictionsResult:
-    from plushsense.experiments.streams.run import score_predictions
-
-    return score_predictions(
-        args.source,
-        args.predictions,
-        subjects=None if args.subjects is None else listed(args.subjects),
-        classes=settings(args).evaluation.classes,
-        threshold=args.threshold or 0.0,
-        late_s=args.late,
-        labels=args.labels == "use",
-        warn=warn,
-    )
 
 
 def _run_split(args: argparse.Namespace) -> int:
@@ -91,9 +71,8 @@ def _run_split(args: argparse.Namespace) -> int:
         warn=warn,
     )
     if args.out:
-        result["out"] = args.out
         say(f"written: {Path(args.out) / PAGE}")
-    emit(args, result, _format_systems(result))
+    emit(args, {**vars(result), **({"out": args.out} if args.out else {})}, _format_systems(result))
     return 0
 
 
@@ -137,6 +116,11 @@ def _format_scores(result: dict[str, Any]) -> list[str]:
     ]
     gestures = [(label, *_row(row)) for label, row in result["per_class"].items()]
     place = result["outside"]
+    labels = [
+        f"{plural(result['practised'], 'event')} named a gesture that was being practised: right, but no hits",
+        f"where a recording or a label says what happened ({result['known_hours']:.2f} h): "
+        f"{_rate(result['false_events_per_known_hour'])} false events an hour",
+    ]
     return [
         *_marks(result),
         table(("person", *_HEAD), [*people, ("all", *_row(result))]),
@@ -148,55 +132,42 @@ def _format_scores(result: dict[str, Any]) -> list[str]:
         f"false events: {result['confused']} within another gesture; outside {place['all']}, of these "
         f"{place['rest']} at rest ({_rate(result['at_rest_per_hour'])} an hour), {place['other']} in gestures that are "
         f"not among the classes, {place['handling']} while the toy was handled",
-        *_format_labels(result),
+        *(labels if result["labelled_stretches"] else []),
         f"outside of true gestures {_rate(result['outside_per_uncovered_hour'])} an hour",
         result["note"],
         *([f"TRAINED ON {', '.join(trained_on)}: no result"] if trained_on else []),
     ]
 
 
-def _format_labels(result: dict[str, Any]) -> list[str]:
-    """Format what the labels between recordings tell; no lines without labels."""
-    if not result["labelled_stretches"]:
-        return []
-    return [
-        f"{plural(result['practised'], 'event')} named a gesture that was being practised: right, but no hits",
-        f"where a recording or a label says what happened ({result['known_hours']:.2f} h): "
-        f"{_rate(result['false_events_per_known_hour'])} false events an hour",
-    ]
-
-
-def _format_systems(result: dict[str, Any]) -> list[str]:
+def _format_systems(result: BenchmarkResult) -> list[str]:
     """Format the scores of the systems as text: a row for each setting, then false events at equal recall."""
-    from plushsense.experiments.streams.score import CHOICES
+    from plushsense.experiments.streams.report import SETTINGS
 
     rows = [
         (system["title"], how, *_row(system[how]))
-        for system in result["systems"].values()
-        for how in ("plain", *CHOICES)
+        for system in result.systems.values()
+        for how in SETTINGS
         if how in system
     ]
-    names = list(result["systems"])
+    names = list(result.systems)
     equal = []
-    for row in result["at_recall"]:
+    for row in result.at_recall:
         cells = [f"{row['recall']:.2f}"]
         for name in names:
             cell = row["systems"][name]
-            ratio = "" if cell["ratio"] is None or name == result["reference"] else f" (x {cell['ratio']:.2f})"
+            ratio = "" if cell["ratio"] is None or name == result.reference else f" (x {cell['ratio']:.2f})"
             cells.append(_rate(cell["false_events_per_hour"]) + ratio)
         equal.append(cells)
-    people = len(result["subjects"])
     return [
-        *_marks(result),
-        f"split {result['split']}, {plural(people, 'person')} left out in turn, seed {result['seed']}",
+        *_marks(vars(result)),
+        f"split {result.split}, {plural(len(result.subjects), 'person')} left out in turn, seed {result.seed}",
         "",
         table(("system", "setting", *_HEAD), rows),
         "",
-        "plain: no threshold; on the people used for fitting, balanced: highest F1; prompt: shortest latency with an "
-        "F1 at most 0.05 lower; quiet: highest F1 with at most 60 false events an hour; cheapest: lowest cost",
+        *(f"{how}: {words}" for how, words in SETTINGS.items()),
         "",
         *(["false events an hour at equal recall:", "", table(("recall", *names), equal), ""] if equal else []),
-        result["note"],
+        result.note,
     ]
 
 

@@ -51,6 +51,7 @@ from plushsense.experiments.streams.score import (
     Fitted,
     PeopleFold,
     Settings,
+    SystemScores,
     crossvalidated_streams,
     people_folds,
     pooled_scores,
@@ -522,6 +523,48 @@ class BenchmarkSpec:
         return tuple(name for name in SYSTEMS if self.systems is None or name in self.systems)
 
 
+@dataclass(frozen=True)
+class BenchmarkResult(SystemScores):
+    """The result of `stream_benchmark`: the scores of the systems, and what they were made of.
+
+    ``labelled`` tells whether every sample of the streams has a label; ``networks`` has the title of each network.
+    """
+
+    split: str
+    dataset: str
+    dataset_hash: str
+    simulated: bool
+    labelled: bool
+    note: str
+    late_s: float
+    labelled_stretches: int
+    subjects: Sequence[str]
+    code_version: str
+    seed: int
+    networks: Mapping[str, str]
+    anywhere: Mapping[str, Any]
+    preset: str
+    training: Mapping[str, Any]
+
+    @property
+    def title(self) -> str:
+        """Data, people and split in one line."""
+        people = f"{len(self.subjects)} people left out in turn ({self.split})"
+        return f"{self.dataset}, {people}{': SIMULATION' * self.simulated}"
+
+    def save(self, out: Path) -> None:
+        """Write JSON, CSV with a row for each point of a curve, a page and its figures to a folder."""
+        from plushsense.experiments.streams.report import curves, latencies, page, point_table
+        from plushsense.reports.figures import png
+
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(out / SHEET, point_table(self).csv())
+        (out / CURVES).write_bytes(png(curves(self), dpi=130))
+        (out / LATENCIES).write_bytes(png(latencies(self), dpi=130))
+        write_file(out / PAGE, page(self))
+        write_file(out / TABLE, json.dumps(vars(self), ensure_ascii=False, indent=1))
+
+
 def stream_benchmark(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
@@ -532,7 +575,7 @@ def stream_benchmark(
     progress: Progress | None = None,
     warn: Warn = python_warning,
     **settings: Any,
-) -> dict[str, Any]:
+) -> BenchmarkResult:
     """Score every system on the streams of people left out, with settings tuned on other people.
 
     In each fold, networks are trained on the training people, every system is tuned on the validation people, and
@@ -541,9 +584,6 @@ def stream_benchmark(
     Args:
         config, settings, warn: as for `train`; also ``workers``.
         out: a folder for the table as JSON and CSV, a page, and its figures.
-
-    Returns:
-        what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note`` and the settings.
     """
     spec = spec or BenchmarkSpec()
     run = prepare(dataset, config or from_settings(**settings))
@@ -567,44 +607,25 @@ def stream_benchmark(
         progress=progress,
     )
     tested = {person for fold in folds for person in fold["test"]}
-    table = {
-        **_described(dataset, spec),
-        "subjects": sorted(tested & set(people_with_streams(dataset))),
-        "code_version": __version__,
-        **summed(folds),
-        "seed": seed,
-        "networks": {name: recipe.arch.title for name, recipe in recipes.items()},
-        "anywhere": dict(vars(run.anywhere)),
-        "preset": run.preset,
-        "training": run.training.to_dict(),
-    }
+    result = BenchmarkResult(
+        **vars(summed(folds)),
+        split=spec.split,
+        dataset=dataset.head.name,
+        dataset_hash=dataset.hash,
+        simulated=dataset.head.simulated,
+        labelled=dataset.layout.is_labelled,
+        note=describe_false_events(dataset),
+        late_s=spec.late_s,
+        labelled_stretches=len(dataset.stretches),
+        subjects=sorted(tested & set(people_with_streams(dataset))),
+        code_version=__version__,
+        seed=seed,
+        networks={name: recipe.arch.title for name, recipe in recipes.items()},
+        anywhere=dict(vars(run.anywhere)),
+        preset=run.preset,
+        training=run.training.to_dict(),
+    )
     if out is not None:
         with dataset.generation.writing():
-            save_benchmark(table, Path(out))
-    return table
-
-
-def _described(dataset: Dataset, spec: BenchmarkSpec) -> dict[str, Any]:
-    return {
-        "split": spec.split,
-        "dataset": dataset.head.name,
-        "dataset_hash": dataset.hash,
-        "simulated": dataset.head.simulated,
-        "labelled": dataset.layout.is_labelled,
-        "note": describe_false_events(dataset),
-        "late_s": spec.late_s,
-        "labelled_stretches": len(dataset.stretches),
-    }
-
-
-def save_benchmark(table: dict[str, Any], out: Path) -> None:
-    """Write a benchmark to a folder: JSON, CSV with a row for each point of a curve, a page and its figures."""
-    from plushsense.experiments.streams.report import curves, latencies, page, point_table
-    from plushsense.reports.figures import png
-
-    out.mkdir(parents=True, exist_ok=True)
-    write_file(out / SHEET, point_table(table).csv())
-    (out / CURVES).write_bytes(png(curves(table), dpi=130))
-    (out / LATENCIES).write_bytes(png(latencies(table), dpi=130))
-    write_file(out / PAGE, page(table))
-    write_file(out / TABLE, json.dumps(table, ensure_ascii=False, indent=1))
+            result.save(Path(out))
+    return result

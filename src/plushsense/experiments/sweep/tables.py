@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -47,7 +48,7 @@ class Table4Row:
     """A row of Table 4 as printed: highest and mean accuracy over nine schedules, and ACR, as shares of 1."""
 
     parameters: str
-    highest: float
+    accuracy: float
     mean: float
     acr: float
 
@@ -178,38 +179,24 @@ def compared(sweep: SweepResult) -> tuple[list[SweepNetwork], bool]:
 def effect(sweep: SweepResult) -> Table:
     """Return mean and standard deviation over the networks for each number of epochs and batch."""
     networks, whole = compared(sweep)
-    rows = []
-    for e in epochs(sweep):
-        for b in batches(sweep):
-            mine = [t for n in networks for t in n.done if (t["epochs"], str(t["batch_asked"])) == (e, b)]
-            scores = [float(t["accuracy"]) for t in mine]
-            keys = [key for key in column_metrics() if key != "accuracy"]
-            others = {key: [float(t[key]) for t in mine if finite(t.get(key))] for key in keys}
-            if scores:
-                rows.append(
-                    {
-                        "epochs": e,
-                        "batch_asked": b,
-                        "networks": len(scores),
-                        "accuracy": statistics.fmean(scores),
-                        "accuracy_sd": spread(scores),
-                        "highest": max(scores),
-                        **{key: statistics.fmean(values) if values else None for key, values in others.items()},
-                        **{f"{key}_sd": spread(values) for key, values in others.items()},
-                    }
-                )
+    rows, metrics = [], column_metrics()
+    for e, b in itertools.product(epochs(sweep), batches(sweep)):
+        mine = [t for n in networks for t in n.done if (t["epochs"], str(t["batch_asked"])) == (e, b)]
+        if mine:
+            row = {"epochs": e, "batch_asked": b, "networks": len(mine)}
+            for key in metrics:
+                values = [float(t[key]) for t in mine if finite(t.get(key))]
+                row |= {key: statistics.fmean(values) if values else None, f"{key}_sd": spread(values)}
+            rows.append({**row, "highest": max(float(t["accuracy"]) for t in mine)})
     columns = (
         Column("epochs", "Epochs", "count"),
         Column("batch_asked", "Batch"),
         Column("networks", "Networks", "count"),
-        Column("accuracy", "Mean accuracy", "percent", score=True),
-        Column("accuracy_sd", "sd over networks", "percent", score=True),
-        Column("highest", "Highest", "percent", score=True),
+        Column("highest", "Highest accuracy", "percent", score=True),
         *(
             Column(f"{key}{part}", head, "percent" if m.percent else "share", score=True)
-            for key, m in column_metrics().items()
-            if key != "accuracy"
-            for part, head in (("", f"Mean {m.name}"), ("_sd", "sd"))
+            for key, m in metrics.items()
+            for part, head in (("", f"Mean {m.name}"), ("_sd", "sd over networks"))
         ),
     )
     note = (
@@ -217,13 +204,8 @@ def effect(sweep: SweepResult) -> Table:
         if whole
         else "No network has every schedule scored yet: each row is over others, and they are not to be compared."
     )
-    return Table(
-        "effect",
-        "Effect of epochs and batch",
-        columns,
-        tuple(rows),
-        (note, "The spread is over networks, not over seeds.") if rows else (),
-    )
+    notes = (note, "The spread is over networks, not over seeds.") if rows else ()
+    return Table("effect", "Effect of epochs and batch", columns, tuple(rows), notes)
 
 
 @dataclass(frozen=True)
@@ -416,10 +398,7 @@ def _table4_row(network: SweepNetwork, rank: int) -> dict[str, Any]:
         **{key: best.get(key) for key in column_metrics() if key != "accuracy"},
         "validated_accuracy": validated["accuracy"] if validated else None,
         "above": "yes" if float(best["accuracy"]) > PAPER_THRESHOLD else "no",
-        "paper_parameters": printed.parameters if printed else None,
-        "paper_accuracy": printed.highest if printed else None,
-        "paper_mean": printed.mean if printed else None,
-        "paper_acr": printed.acr if printed else None,
+        **{f"paper_{name}": getattr(printed, name, None) for name in ("parameters", "accuracy", "mean", "acr")},
         "paper_split": AUTHORS_SPLIT if printed else None,
     }
 
