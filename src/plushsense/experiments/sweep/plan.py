@@ -269,10 +269,7 @@ def _within_limits(
             "networks."
         )
     if beyond:
-        filters: dict[str, list[str]] = {}
-        for arch in beyond:
-            filters.setdefault(arch.symbol, []).append(slashed(arch.filters))
-        named = "; ".join(f"{symbol} with {', '.join(several)}" for symbol, several in filters.items())
+        named = "; ".join(f"{arch.symbol} with {slashed(arch.filters)}" for arch in beyond)
         warn(
             Message(
                 "{n} of {of} networks are beyond the limits and left out: {names}",
