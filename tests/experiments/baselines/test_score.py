@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,6 @@ from plushsense.jobs.journal import Journal
 from plushsense.jobs.pool import JobsSpec
 from plushsense.jobs.progress import JobProgress
 from plushsense.windows.cut import WindowSet
-
-HERE = Path(__file__).parents[2]
-
 from support.fakes import LABELS, study
 
 pytestmark = [pytest.mark.usefixtures("scikit_learn"), pytest.mark.apart("models")]
@@ -32,13 +28,11 @@ class Known:
     """Knows a recording that it was trained on, and nothing else; leaves a mark for each fit."""
 
     folder: str
-    pause: float = 0.0
 
     def __call__(self, train: WindowSet, validation: WindowSet, /) -> KnownReader:
         assert len(validation)
         with Path(self.folder, "fits").open("a") as file:
             file.write("x")
-        time.sleep(self.pause)
         return KnownReader(tuple(np.unique(train.integers[:, 1, 0]).tolist()))
 
 
@@ -64,8 +58,8 @@ class Misshapen:
         return self if len(sets) == 2 else np.zeros((1, 1), dtype=np.float32)
 
 
-def known(folder: Path, name: str = "known", pause: float = 0.0, **key: Any) -> Contender:
-    return Contender(name, f"the {name} one", "windows", False, Known(str(folder), pause), key)
+def known(folder: Path, name: str = "known", **key: Any) -> Contender:
+    return Contender(name, f"the {name} one", "windows", False, Known(str(folder)), key)
 
 
 def fits(folder: Path) -> int:
