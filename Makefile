@@ -49,7 +49,7 @@ $(VENV)/.train: $(VENV)/.torch
 	$(INSTALL)
 	@touch $@
 
-$(VENV)/.dev: EXTRAS := train,baselines,ble,cluster,lsl,matlab,mlflow,onnx,publish,studio,tables,tflite,dev,docs
+$(VENV)/.dev: EXTRAS := train,baselines,ble,cluster,lsl,matlab,onnx,publish,studio,tables,tflite,dev,docs
 $(VENV)/.dev: $(VENV)/.torch
 	$(INSTALL)
 	@touch $@ $(VENV)/.train

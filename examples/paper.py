@@ -29,8 +29,7 @@ from plushsense.experiments.baselines.run import ComparisonSpec, baselines
 from plushsense.experiments.baselines.score import UNSCALED, Pca, reads
 from plushsense.experiments.sweep.grid import CHOSEN
 from plushsense.experiments.sweep.report import training_settings
-from plushsense.experiments.sweep.results import read_sweep
-from plushsense.experiments.sweep.run import sweep
+from plushsense.experiments.sweep.run import SweepSpec, sweep
 from plushsense.experiments.sweep.tables import TABLE4
 from plushsense.scoring.splits import make_folds, parse_split
 from plushsense.windows.cut import WindowSpec
@@ -162,27 +161,30 @@ class Paper:
         # Reduced to the trials of the paper's Table 4.
         swept = sweep(
             self.dataset,
-            grid,
-            architectures=(symbol,),
-            filters=",".join(filter_sets),
-            epochs=(2,) if self.quick else (250,),
-            batches=(64,),
-            seeds=tuple(range(self.seeds)),
-            out=self.out / "sweeps" / f"{symbol}-{self.seeds}-{grid}{'-quick' * self.quick}",
+            SweepSpec(
+                grid,
+                {
+                    "architectures": (symbol,),
+                    "filters": ",".join(filter_sets),
+                    "epochs": (2,) if self.quick else (250,),
+                    "batches": (64,),
+                    "seeds": tuple(range(self.seeds)),
+                },
+                out=self.out / "sweeps" / f"{symbol}-{self.seeds}-{grid}{'-quick' * self.quick}",
+            ),
         )
-        results = read_sweep(swept.out)
-        described = [("Split", swept.head.split), ("Context", swept.head.context)]
-        described += [("Padding", swept.trials["padding"][0]), *training_settings(results)]
+        described = [("Split", swept.head["split"]), ("Context", swept.head["context"])]
+        described += [("Padding", swept.rows[0]["padding"]), *training_settings(swept)]
         self.settings[grid] = "; ".join(f"{key.lower()}: {value}" for key, value in described)
-        tested = swept.runs["test_windows"][0]
+        tested = swept.run_rows[0]["test_windows"]
         rows = []
-        for trial in swept.trials.iter_rows(named=True):
+        for trial in swept.rows:
             spread = f" ± {100 * trial['accuracy_sd']:.1f}" if self.seeds > 1 else ""
             rows.append(
                 Row(
                     "search",
                     f"{symbol} {trial['filters']}, accuracy ({about})",
-                    f"{100 * TABLE4[symbol, trial['filters']].highest:.1f} %",
+                    f"{100 * TABLE4[symbol, trial['filters']].accuracy:.1f} %",
                     f"{100 * trial['accuracy']:.1f} %{spread}",
                     f"{seeds_text(self.seeds)}, {tested} windows",
                 )

@@ -280,14 +280,6 @@ def cluster_possible() -> None:
 
 
 @pytest.fixture(scope="session")
-def mlflow_here() -> None:
-    """MLflow with a database (extra mlflow)."""
-    for module in ("mlflow", "sqlalchemy", "alembic"):
-        if importlib.util.find_spec(module) is None:
-            missing("mlflow", f"{module} is not installed")
-
-
-@pytest.fixture(scope="session")
 def onnx_here() -> None:
     """ONNX and the runtime that tries it (extra onnx)."""
     for module in ("onnx", "onnxruntime"):

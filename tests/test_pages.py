@@ -218,9 +218,7 @@ SMALL = {
     "verify --dataset": {"--samples": "500"},
     "profile": {"--target": "host"},
     "sweep": {
-        "--architectures": "14d1_39d2_41d4,19d1_19d2_19d4_17d8",
-        "--filters": "4/6/8/8",
-        "--batches": "64",
+        "--set": "architectures=14d1_39d2_41d4,19d1_19d2_19d4_17d8 --set filters=4/6/8/8 --set batches=64",
     },
     "sweep --halving": {"--epochs": "!1,2", "--share": "1"},
 }
@@ -315,7 +313,7 @@ def run(command: str) -> tuple[int, str]:
     words = [re.sub(r"P01/[\w ]+_\d{13}_\d+", f"P01/{first.stem}", word) for word in words]
     for option, value in small.items():
         if option not in words:
-            words += [option, value.removeprefix("!")] if value else [option]
+            words += [option, *value.removeprefix("!").split()]
         elif value.startswith("!"):
             words[words.index(option) + 1] = value[1:]
     args = vars(parser_of(words[0]).parse_args(words[1:]))

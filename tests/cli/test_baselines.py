@@ -80,7 +80,7 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
     for words, said in (
         (("--models", "forests"), "Unknown model 'forests': accepted are quick,"),
         (("--features", "raw"), "Unknown features 'raw': accepted are statistics, paper-statistics, flattened."),
-        (("--models", "lstm:128"), "Did you mean 'lstm:units=128'?"),
+        (("--models", "lstm:128"), "accepted are :units=NUMBER"),
         (("--pca", "maybe"), "Unknown choice 'maybe' for PCA: accepted are both, no, yes, unscaled, all."),
         (("--split", "windows"), "needs a number of folds"),
         (("--split", "windows:3,windows:3"), "given twice"),

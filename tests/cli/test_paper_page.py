@@ -41,10 +41,8 @@ SMALL = {
     "baselines": {"--epochs": "1", "--workers": "1"},
     "stream-eval": {"--epochs": "1"},
     "sweep": {
-        "--architectures": "14d1_39d2_41d4,19d1_19d2_19d4_17d8",
-        "--filters": "4/6/8/8",
+        "--set": "architectures=14d1_39d2_41d4,19d1_19d2_19d4_17d8 --set filters=4/6/8/8 --set batches=64",
         "--epochs": "1",
-        "--batches": "64",
         "--workers": "1",
     },
 }
@@ -86,7 +84,8 @@ def run(command: str) -> tuple[int, str]:
             examples = runpy.run_path(str(ROOT / words[0]), run_name="example")
             return examples["main"](words[1:]), said.getvalue()
         small = SMALL.get(words[0], {})
-        status = main([*words, *(part for option in small.items() if option[0] not in words for part in option)])
+        added = (" ".join(option).split() for option in small.items() if option[0] not in words)
+        status = main([*words, *(word for option in added for word in option)])
     return status, said.getvalue()
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.streams.run import streams_at
+from plushsense.experiments.recordings import opened
 from plushsense.experiments.streams.systems import SYSTEMS
 from plushsense.models.bundle import Bundle, trained_people
 
@@ -113,7 +113,7 @@ def test_a_folder_of_the_recorder_gives_what_its_data_set_gives(
     other = cli("stream-eval", dataset.path, "--model", bundle, "--subjects", person, "--json").json
     assert {k: one[k] for k in KEYS} == {k: other[k] for k in KEYS}
     assert sorted(p.name for p in folder.rglob("*")) == before
-    with streams_at(folder, Bundle.load(bundle)) as made:
+    with opened(folder, Bundle.load(bundle).layout) as made:
         place = made.path
         assert made.subjects == [person]
     assert not place.exists()
@@ -189,7 +189,6 @@ def test_every_system_on_people_left_out(cli: Cli, dataset: Dataset, tmp_path: P
         (("--split", "by-subject:2", "--late", "-1"), "accepted are 0 to 10 seconds"),
         (("--split", "by-subject:2", "--padding", "mirror"), "cannot follow a stream"),
         (("--model", "m.plush", "--out", "X"), "belong to --split"),
-        (("--split", "by-subject:2", "--anywhere-pool", "0"), "accepted is above 0"),
     ],
 )
 def test_refusals(cli: Cli, dataset: Dataset, words: tuple[str, ...], said: str) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plushsense.core.errors import BadInput
-from plushsense.experiments.adaptation import AdaptationScores, ChoiceSpec, HeldOutPerson, Predictors, try_adapting
+from plushsense.experiments.adaptation import AdaptingResult, Predictor, try_adapting
+from plushsense.live.adaptation import PersonalSpec
 from plushsense.windows.cut import WindowSet
 from support.fakes import plain_units
 
@@ -62,67 +62,44 @@ def truth(windows: WindowSet) -> np.ndarray:
 class Recorder:
     """An adaptation that remembers what it was given."""
 
-    def __init__(self, reader=truth, accepted: bool = True) -> None:
+    def __init__(self, reader: Predictor = truth, accepted: bool = True) -> None:
         self.given: list[WindowSet] = []
         self.reader, self.accepted = reader, accepted
 
-    def __call__(self, own: WindowSet) -> Predictors | None:
+    def __call__(self, own: WindowSet) -> Predictor | None:
         self.given.append(own)
-        return {"float": self.reader} if self.accepted else None
+        return self.reader if self.accepted else None
 
 
-def score_adaptation(
-    windows: WindowSet, people: list[HeldOutPerson], times: dict[str, int], random: int = 0
-) -> AdaptationScores:
-    choice = ChoiceSpec(random=random)
-    return AdaptationScores.over("stream", choice, [try_adapting(windows, p, times, choice) for p in people])
+def tried(people: dict[str, tuple[Predictor, Recorder]]) -> AdaptingResult:
+    windows, times = made()
+    gains = [try_adapting(windows, who, *readers, times, 2) for who, readers in people.items()]
+    return AdaptingResult("by-subject:2", False, "stream", 2, PersonalSpec(), tuple(g for g in gains if g is not None))
 
 
 def test_all_choices_and_what_is_gained() -> None:
-    windows, times = made()
     adapt = Recorder()
-    found = score_adaptation(windows, [HeldOutPerson(p, {"float": always_hold}, adapt) for p in ("A", "B")], times)
+    found = tried({"A": (always_hold, adapt), "B": (always_hold, adapt)})
     assert found.choices == 12 and len(adapt.given) == 12 and found.refused == 0.0
     assert all(len(own) == 6 and len(set(own.subject)) == 1 for own in adapt.given)
-    one = found.engines["float"]
-    means = {score: {when: spread["mean"] for when, spread in at.items()} for score, at in one.scores.items()}
-    assert means["accuracy"] == pytest.approx({"before": 1 / 3, "after": 1.0, "gain": 2 / 3, "first": 2 / 3})
-    assert means["macro_f1"]["after"] == 1.0
-    assert one.right == {"mean": 4.0, "worst_mean": 4.0, "worst": 4, "worse_people": 0, "worse_choices": 0.0}
-    assert [row.subject for row in one.people] == ["A", "B"] and one.people[0].recordings == 6.0
-
-
-def test_the_first_choice_is_the_first_recordings_by_the_clock() -> None:
-    windows, times = made()
-    adapt = Recorder()
-    score_adaptation(windows, [HeldOutPerson("A", {"float": always_hold}, adapt)], times)
-    first = {windows.recording_ids[r] for r in adapt.given[0].recording}
-    assert first == {f"A/{label}_{n}" for label in LABELS for n in (9, 8)}
+    means = {when: spread.mean for when, spread in found.score("accuracy").items()}
+    assert means == pytest.approx({"before": 1 / 3, "after": 1.0, "gain": 2 / 3, "first": 2 / 3})
+    assert found.score("macro_f1")["after"].mean == 1.0
+    assert found.right == {"mean": 4.0, "worst_mean": 4.0, "worst": 4, "worse_people": 0, "worse_choices": 0.0}
+    assert [row.subject for row in found.people] == ["A", "B"] and found.people[0].recordings == 6.0
+    # The first choice is the first recordings by the clock.
+    ids = made()[0].recording_ids
+    assert {ids[r] for r in adapt.given[0].recording} == {f"A/{label}_{n}" for label in LABELS for n in (9, 8)}
 
 
 def test_a_loss_is_counted_person_by_person_and_choice_by_choice() -> None:
-    windows, times = made()
-    people = [
-        HeldOutPerson("A", {"float": truth}, Recorder(always_hold)),
-        HeldOutPerson("B", {"float": always_hold}, Recorder(truth)),
-    ]
-    right = score_adaptation(windows, people, times).engines["float"].right
-    assert right == {"mean": 0.0, "worst_mean": -4.0, "worst": -4, "worse_people": 1, "worse_choices": 0.5}
+    found = tried({"A": (truth, Recorder(always_hold)), "B": (always_hold, Recorder(truth))})
+    assert found.right == {"mean": 0.0, "worst_mean": -4.0, "worst": -4, "worse_people": 1, "worse_choices": 0.5}
 
 
 def test_what_is_refused_changes_nothing() -> None:
-    windows, times = made()
-    found = score_adaptation(windows, [HeldOutPerson("A", {"float": truth}, Recorder(always_hold, False))], times)
-    assert found.refused == 1.0 and found.engines["float"].right["mean"] == 0.0
-
-
-def test_random_choices_differ_from_gesture_to_gesture() -> None:
-    windows, times = made()
-    adapt = Recorder()
-    found = score_adaptation(windows, [HeldOutPerson("A", {"float": always_hold}, adapt)], times, random=20)
-    assert found.choices == 26
-    mixed = [{windows.recording_ids[r][-1] for r in own.recording} for own in adapt.given[6:]]
-    assert any(len(numbers) > 2 for numbers in mixed) and all(len(own) == 6 for own in adapt.given)
+    found = tried({"A": (truth, Recorder(always_hold, False))})
+    assert found.refused == 1.0 and found.right["mean"] == 0.0
 
 
 def test_no_adapting_window_touches_a_tested_recording() -> None:
@@ -133,25 +110,13 @@ def test_no_adapting_window_touches_a_tested_recording() -> None:
         tested.append(test)
         return always_hold(test)
 
-    score_adaptation(windows, [HeldOutPerson("A", {"float": reads}, adapt)], times)
+    try_adapting(windows, "A", reads, adapt, times, 2)
     for own, test in zip(adapt.given, tested, strict=True):
         for first, last in test.recording_rows:
             assert not ((own.window_rows[:, 0] < last) & (first < own.window_rows[:, 1])).any()
     assert any(len(own) < 6 for own in adapt.given)
 
 
-def test_engines_are_compared() -> None:
-    windows, times = made()
-
-    def adapt(own: WindowSet) -> Predictors:
-        return {"float": truth, "int8": truth}
-
-    found = score_adaptation(windows, [HeldOutPerson("A", {"float": truth, "int8": always_hold}, adapt)], times)
-    assert found.agreement == {"before": pytest.approx(1 / 3), "after": 1.0}
-    assert set(found.engines) == {"float", "int8"}
-
-
 def test_too_few_recordings_to_test() -> None:
     windows, times = made(each=2)
-    with pytest.raises(BadInput, match="more than 2 recordings"):
-        score_adaptation(windows, [HeldOutPerson("A", {"float": truth}, Recorder())], times)
+    assert try_adapting(windows, "A", truth, Recorder(), times, 2) is None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -190,32 +189,6 @@ def test_a_killed_run_goes_on_where_it_stood(tmp_path: Path, workers: int) -> No
     assert subprocess.run([sys.executable, str(script)], timeout=60).returncode == 0
     assert all(journal.load(f"job{n}")["value"] == n for n in range(6))
     assert {n: len((tmp_path / f"started-{n}").read_text()) for n in finished} == starts
-
-
-@pytest.mark.skipif(os.name == "nt", reason="kill -9 is another thing on Windows")
-def test_killed_at_three_random_moments_the_results_are_those_of_an_undisturbed_run(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT.format(here=str(HERE), folder=str(tmp_path), workers=2))
-    journal = Journal(tmp_path / "journal")
-    rng = random.Random()
-    kept: dict[str, int] = {}
-    for _ in range(3):
-        run = subprocess.Popen([sys.executable, str(script)])
-        # From before the first worker is up to after the first jobs.
-        time.sleep(rng.uniform(0.1, 1.2))
-        run.kill()
-        run.wait()
-        now = {p.name: p.stat().st_mtime_ns for p in journal.folder.glob("*.npz")}
-        # What was kept stays, and is not made again.
-        assert kept.items() <= now.items()
-        kept = now
-    assert subprocess.run([sys.executable, str(script)], timeout=60).returncode == 0
-    # Orphans of the killed runs may have had the last word on jobs that were not kept then.
-    time.sleep(0.5)
-    assert kept.items() <= {p.name: p.stat().st_mtime_ns for p in journal.folder.glob("*.npz")}.items()
-    undisturbed = run_jobs([Job(f"job{n}", n) for n in range(6)], work.tick, shared=str(tmp_path))
-    assert {f"job{n}": journal.load(f"job{n}") for n in range(6)} == undisturbed
-    assert sorted(p.stem for p in journal.folder.glob("*.npz")) == [f"job{n}" for n in range(6)]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Ctrl-C is sent in another way on Windows")

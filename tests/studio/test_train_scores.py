@@ -30,6 +30,7 @@ from plushsense.studio.pages.train.results import (
     whole,
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits, of_ten, people_table
+from support.sweeping import keys
 
 pytestmark = [pytest.mark.apart("train-scores"), pytest.mark.early]
 
@@ -123,7 +124,7 @@ def test_an_evaluation_has_the_same_figure_everywhere(home: Path, capsys: pytest
 def test_every_network_whose_predictions_a_sweep_kept_leads_to_its_recordings(
     home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    network = ["--architectures", "9,5", "--filters", "2", "--epochs", "1", "--batches", "64", "--workers", "1"]
+    network = [*keys(architectures="9,5", filters="2", batches="64"), "--epochs", "1", "--workers", "1"]
     folder = home / "datasets" / "virtual"
     assert main(["sweep", str(folder), *network, "--keep-predictions", "all", "--json"]) == 0
     out = Path(json.loads(capsys.readouterr().out)["out"])

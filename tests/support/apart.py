@@ -1,7 +1,7 @@
 """Test files in a process of their own beside a worker: what they load and keep is gone when it ends.
 
-A worker collects all tests of its run and keeps what one of them has loaded: scikit-learn 120 MB, MLflow
-190 MB. The files with one mark ``pytestmark = pytest.mark.apart("NAME")`` run in a fork of a server process, which has
+A worker collects all tests of its run and keeps what one of them has loaded: scikit-learn 120 MB, Ray
+more. The files with one mark ``pytestmark = pytest.mark.apart("NAME")`` run in a fork of a server process, which has
 collected all marked files. The fork ends when the worker comes to another name, or after a test that leaves more than
 `ENOUGH_MB` allocated. Such a file imports what it shares a process for within its tests: see `_refuse_threads`.
 

@@ -8,7 +8,7 @@ import pytest
 
 import plushsense as ps
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.sweep.run import preview
+from plushsense.experiments.sweep.run import SweepSpec, preview
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.estimate import PASSES, preview_evaluation, preview_training
 from plushsense.workflow.preparation import prepare
@@ -45,8 +45,10 @@ def test_an_evaluation_is_told_as_it_then_is(dataset: Dataset) -> None:
 
 def test_grids_are_measured_where_it_is_asked_for(dataset: Dataset) -> None:
     small = {"filters": "4,4", "epochs": "1,2", "batches": "full", "split": "by-subject:2"}
-    assert preview(dataset, architectures="14d1_5d1", **small).seconds is None
-    whole = preview(dataset, measure=True, architectures="14d1_5d1", **small)
+    one = SweepSpec(changes={**small, "architectures": "14d1_5d1"})
+    assert preview(dataset, one).seconds is None
+    whole = preview(dataset, one, measure=True)
     assert whole.problems == () and whole.seconds and whole.seconds > 0
-    halved = preview(dataset, measure=True, halving=True, architectures="14d1_5d1,9d1_5d1,5d1_5d1", **small)
+    halving = {**small, "halving": True, "architectures": "14d1_5d1,9d1_5d1,5d1_5d1"}
+    halved = preview(dataset, SweepSpec(changes=halving), measure=True)
     assert halved.halving and halved.seconds and halved.seconds > 0

@@ -21,9 +21,9 @@ from plushsense.dataset.store import Dataset
 from plushsense.experiments.adaptation import evaluate_adapting
 from plushsense.experiments.baselines.run import ComparisonSpec, baselines
 from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
-from plushsense.experiments.sweep.run import sweep
 from plushsense.workflow.api import unfinished
 from plushsense.workflow.datasets import PublishSpec, share_copy
+from support.sweeping import sweep
 
 pytestmark = pytest.mark.apart("trainings")
 

@@ -79,8 +79,6 @@ def _evaluate(args: argparse.Namespace) -> int:
         settings(args),
         split=args.split or "leave-one-subject-out",
         use=2 if args.use is None else args.use,
-        random=args.choices or 0,
-        int8=args.int8,
         progress=report_jobs("adapting"),
         warn=warn,
     )
@@ -89,38 +87,30 @@ def _evaluate(args: argparse.Namespace) -> int:
 
 
 def _evaluation_lines(result: AdaptingResult) -> list[str]:
-    scores, choice = result.scores, result.scores.choice
-    out = marks({"simulated": result.simulated, "leaky": False})
-    out.append(
-        f"split {result.split}, context {scores.context}; {plural(choice.use, 'recording')} of each gesture adapt, the "
-        f"rest test; {scores.choices} choices of recordings, {100 * scores.refused:.1f} % left the bundle as it is\n"
-    )
-    head = ("subject", "tested", "accuracy", "after", "macro-F1", "after", "more correct", "worst choice")
-    for engine, gains in scores.engines.items():
-        rows = [
-            (
-                row.subject,
-                f"{row.recordings:.0f}",
-                *(figure(row.scores[s][w]) for s in ("accuracy", "macro_f1") for w in ("before", "after")),
-                f"{row.right_change:.1f}",
-                row.right_change_worst,
-            )
-            for row in gains.people
-        ]
-        out += [f"{engine}\n", table(head, rows), ""]
-        for score, name in (("accuracy", "accuracy"), ("macro_f1", "macro-F1")):
-            for when in ("before", "after", "gain", "first"):
-                label = "gain, first recordings" if when == "first" else when
-                out.append(f"{name} {label:<24}{spread(gains.scores[score][when])}")
-        right = gains.right
-        out.append(
-            f"recordings correct, after minus before: mean {right['mean']:.1f}; the person who gains least "
-            f"{right['worst_mean']:.1f}, the worst single choice {right['worst']}; people worse by more than one: "
-            f"{right['worse_people']}, choices: {100 * right['worse_choices']:.1f} %\n"
+    rows = [
+        (
+            row.subject,
+            f"{row.recordings:.0f}",
+            *(figure(row.scores[s][w]) for s in ("accuracy", "macro_f1") for w in ("before", "after")),
+            f"{row.right_change:.1f}",
+            row.right_change_worst,
         )
-    if same := scores.agreement:
-        out.append(
-            f"float and int8 agree on {100 * same['before']:.1f} % of the windows, after adapting "
-            f"{100 * same['after']:.1f} %"
-        )
-    return [*out, "For people with one session, this does not show whether the gain lasts until another day."]
+        for row in result.people
+    ]
+    right = result.right
+    return [
+        *marks({"simulated": result.simulated, "leaky": False}),
+        f"split {result.split}, context {result.context}; {plural(result.use, 'recording')} of each gesture adapt, the "
+        f"rest test; {result.choices} choices of recordings, {100 * result.refused:.1f} % left the bundle as it is\n",
+        table(("subject", "tested", "accuracy", "after", "macro-F1", "after", "more correct", "worst choice"), rows),
+        "",
+        *(
+            f"{name} {'gain, first recordings' if when == 'first' else when:<24}{spread(one.to_json())}"
+            for score, name in (("accuracy", "accuracy"), ("macro_f1", "macro-F1"))
+            for when, one in result.score(score).items()
+        ),
+        f"recordings correct, after minus before: mean {right['mean']:.1f}; the person who gains least "
+        f"{right['worst_mean']:.1f}, the worst single choice {right['worst']}; people worse by more than one: "
+        f"{right['worse_people']}, choices: {100 * right['worse_choices']:.1f} %\n",
+        "For people with one session, this does not show whether the gain lasts until another day.",
+    ]

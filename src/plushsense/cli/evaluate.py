@@ -116,8 +116,8 @@ def run_report(args: argparse.Namespace) -> int:
 
     if is_sweep(args.out):
         return _sweep_report(args)
-    if args.dataset is None or args.page or args.mlflow:
-        problem = "--dataset is missing" if args.dataset is None else "--page and --mlflow are for a sweep"
+    if args.dataset is None or args.page:
+        problem = "--dataset is missing" if args.dataset is None else "--page is for a sweep"
         raise ConfigError(
             f"'{args.out}' is not a folder written by sweep, and {problem}: give a sweep's folder, or  "
             "plushsense report OUT.html --dataset DATASET"
@@ -138,7 +138,7 @@ def _sweep_report(args: argparse.Namespace) -> int:
         raise ConfigError(
             f"'{args.out}' is a sweep: --dataset, --evaluation, --model and --recording are for a page of evaluations."
         )
-    done = write_sweep_report(args.out, args.page, title=args.title, mlflow=args.mlflow)
+    done = write_sweep_report(args.out, args.page, title=args.title)
     emit(args, done.to_json(), [f"{done.report}: {done.done} of {plural(done.trials, 'trial')}", *done.summary])
     return 0
 

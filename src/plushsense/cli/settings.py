@@ -38,26 +38,6 @@ def seconds_between(option: str, text: str) -> tuple[float | None, float | None]
         raise ConfigError(f"{option} was given '{text}': seconds as FROM:TO are accepted, such as 0.35:2.1.") from None
 
 
-_MOST_SEEDS = 1000
-_GRID_OPTIONS = (
-    *("architectures", "filters", "batches", "padding", "norm", "scaling", "weight_decay", "context", "classes"),
-    *("device", "threads"),
-)
-
-
-def grid_changes(args: argparse.Namespace, *more: str) -> dict[str, Any]:
-    """Return the values of the options that change a grid, and of the options ``more``."""
-    if args.seeds is not None and args.seeds > _MOST_SEEDS:
-        raise ConfigError(f"--seeds is {args.seeds}: accepted are 1 to {_MOST_SEEDS} seeds.")
-    # ``--seeds 0`` gives an empty tuple, which is reported with the other problems of the grid.
-    return options(args, *_GRID_OPTIONS, *more) | {"seeds": None if args.seeds is None else tuple(range(args.seeds))}
-
-
-def work_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments of a sweep or search for the output folder and the workers."""
-    return {"overwrite": args.force, "workers": args.workers or 0} | options(args, "out", "cluster")
-
-
 def marks(result: Mapping[str, Any]) -> list[str]:
     """Return the notices to print above scores if they come from simulated data or a leaky split."""
     notices = []

@@ -16,7 +16,7 @@ from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.experiments.protocol.score import ProtocolResult
-    from plushsense.experiments.streams.run import PredictionsResult, StreamEvalResult
+    from plushsense.experiments.streams.run import BenchmarkResult, PredictionsResult, StreamEvalResult
 
 
 def run_stream_eval(args: argparse.Namespace) -> int:
@@ -33,41 +33,21 @@ def run_stream_eval(args: argparse.Namespace) -> int:
         raise ConfigError("--events belongs to --model: leave it out.")
     if args.split is not None:
         return _run_split(args)
-    if args.out or args.systems or args.anywhere_pool is not None:
-        raise ConfigError("--out, --systems and --anywhere-pool belong to --split: leave them out, or give --split.")
-    scored = _score_model(args) if args.model is not None else _score_predictions(args)
+    if args.out or args.systems:
+        raise ConfigError("--out and --systems belong to --split: leave them out, or give --split.")
+    from plushsense.experiments.streams.run import score_predictions, stream_eval
+
+    people: dict[str, Any] = {"subjects": None if args.subjects is None else listed(args.subjects)}
+    people |= {"late_s": args.late, "labels": args.labels == "use", "warn": warn}
+    scored: PredictionsResult | StreamEvalResult
+    if args.model is not None:
+        scored = stream_eval(args.source, args.model, events=args.events, **people)
+    else:
+        classes, threshold = settings(args).evaluation.classes, args.threshold or 0.0
+        scored = score_predictions(args.source, args.predictions, classes=classes, threshold=threshold, **people)
     result = scored.to_json()
     emit(args, result, _format_scores(result))
     return 0
-
-
-def _score_model(args: argparse.Namespace) -> StreamEvalResult:
-    from plushsense.experiments.streams.run import stream_eval
-
-    return stream_eval(
-        args.source,
-        args.model,
-        subjects=None if args.subjects is None else listed(args.subjects),
-        late_s=args.late,
-        events=args.events,
-        labels=args.labels == "use",
-        warn=warn,
-    )
-
-
-def _score_predictions(args: argparse.Namespace) -> PredictionsResult:
-    from plushsense.experiments.streams.run import score_predictions
-
-    return score_predictions(
-        args.source,
-        args.predictions,
-        subjects=None if args.subjects is None else listed(args.subjects),
-        classes=settings(args).evaluation.classes,
-        threshold=args.threshold or 0.0,
-        late_s=args.late,
-        labels=args.labels == "use",
-        warn=warn,
-    )
 
 
 def _run_split(args: argparse.Namespace) -> int:
@@ -84,7 +64,6 @@ def _run_split(args: argparse.Namespace) -> int:
             None if args.systems is None else listed(args.systems),
             args.late,
             args.labels == "use",
-            args.anywhere_pool,
         ),
         out=args.out,
         overwrite=args.force,
@@ -92,9 +71,8 @@ def _run_split(args: argparse.Namespace) -> int:
         warn=warn,
     )
     if args.out:
-        result["out"] = args.out
         say(f"written: {Path(args.out) / PAGE}")
-    emit(args, result, _format_systems(result))
+    emit(args, {**vars(result), **({"out": args.out} if args.out else {})}, _format_systems(result))
     return 0
 
 
@@ -138,6 +116,11 @@ def _format_scores(result: dict[str, Any]) -> list[str]:
     ]
     gestures = [(label, *_row(row)) for label, row in result["per_class"].items()]
     place = result["outside"]
+    labels = [
+        f"{plural(result['practised'], 'event')} named a gesture that was being practised: right, but no hits",
+        f"where a recording or a label says what happened ({result['known_hours']:.2f} h): "
+        f"{_rate(result['false_events_per_known_hour'])} false events an hour",
+    ]
     return [
         *_marks(result),
         table(("person", *_HEAD), [*people, ("all", *_row(result))]),
@@ -149,55 +132,42 @@ def _format_scores(result: dict[str, Any]) -> list[str]:
         f"false events: {result['confused']} within another gesture; outside {place['all']}, of these "
         f"{place['rest']} at rest ({_rate(result['at_rest_per_hour'])} an hour), {place['other']} in gestures that are "
         f"not among the classes, {place['handling']} while the toy was handled",
-        *_format_labels(result),
+        *(labels if result["labelled_stretches"] else []),
         f"outside of true gestures {_rate(result['outside_per_uncovered_hour'])} an hour",
         result["note"],
         *([f"TRAINED ON {', '.join(trained_on)}: no result"] if trained_on else []),
     ]
 
 
-def _format_labels(result: dict[str, Any]) -> list[str]:
-    """Format what the labels between recordings tell; no lines without labels."""
-    if not result["labelled_stretches"]:
-        return []
-    return [
-        f"{plural(result['practised'], 'event')} named a gesture that was being practised: right, but no hits",
-        f"where a recording or a label says what happened ({result['known_hours']:.2f} h): "
-        f"{_rate(result['false_events_per_known_hour'])} false events an hour",
-    ]
-
-
-def _format_systems(result: dict[str, Any]) -> list[str]:
+def _format_systems(result: BenchmarkResult) -> list[str]:
     """Format the scores of the systems as text: a row for each setting, then false events at equal recall."""
-    from plushsense.experiments.streams.score import CHOICES
+    from plushsense.experiments.streams.report import SETTINGS
 
     rows = [
         (system["title"], how, *_row(system[how]))
-        for system in result["systems"].values()
-        for how in ("plain", *CHOICES)
+        for system in result.systems.values()
+        for how in SETTINGS
         if how in system
     ]
-    names = list(result["systems"])
+    names = list(result.systems)
     equal = []
-    for row in result["at_recall"]:
+    for row in result.at_recall:
         cells = [f"{row['recall']:.2f}"]
         for name in names:
             cell = row["systems"][name]
-            ratio = "" if cell["ratio"] is None or name == result["reference"] else f" (x {cell['ratio']:.2f})"
+            ratio = "" if cell["ratio"] is None or name == result.reference else f" (x {cell['ratio']:.2f})"
             cells.append(_rate(cell["false_events_per_hour"]) + ratio)
         equal.append(cells)
-    people = len(result["subjects"])
     return [
-        *_marks(result),
-        f"split {result['split']}, {plural(people, 'person')} left out in turn, seed {result['seed']}",
+        *_marks(vars(result)),
+        f"split {result.split}, {plural(len(result.subjects), 'person')} left out in turn, seed {result.seed}",
         "",
         table(("system", "setting", *_HEAD), rows),
         "",
-        "plain: no threshold; on the people used for fitting, balanced: highest F1; prompt: shortest latency with an "
-        "F1 at most 0.05 lower; quiet: highest F1 with at most 60 false events an hour; cheapest: lowest cost",
+        *(f"{how}: {words}" for how, words in SETTINGS.items()),
         "",
         *(["false events an hour at equal recall:", "", table(("recall", *names), equal), ""] if equal else []),
-        result["note"],
+        result.note,
     ]
 
 
@@ -222,8 +192,8 @@ def run_protocol(args: argparse.Namespace) -> int:
 
 
 def _protocol_lines(result: ProtocolResult) -> list[str]:
-    """Format the outcome of the protocol as text: the table, the aims and the notes."""
-    from plushsense.experiments.protocol.report import SIMULATION, aim_table, between_table, group_table
+    """Format the outcome of the protocol as text: the table and the notes."""
+    from plushsense.experiments.protocol.report import SIMULATION, between_table, group_table
 
     out = [result.heading, *([SIMULATION] if result.simulated else [])]
     out += [f"{name}: {value}" for name, value in result.about]
@@ -233,7 +203,5 @@ def _protocol_lines(result: ProtocolResult) -> list[str]:
         f"{row['negative']} negative events, {row['none']} without affect: {row['reactions']} an hour"
         for row in between_table(result).rows
     ]
-    if result.aims:
-        out += ["", *(f"{row['met']}: {row['aim']}: {row['measured']}" for row in aim_table(result).rows)]
     out += ["", *result.said]
     return [*out, f"written: {result.files[0]}"] if result.files else out

@@ -3,37 +3,57 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, table, warn
-from plushsense.cli.settings import grid_changes, marks, work_options
+from plushsense.cli.settings import marks
+from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
-    from plushsense.experiments.sweep.folder import SweepResult
-    from plushsense.experiments.sweep.halving import Halving, RungResult
+    from plushsense.experiments.sweep.results import SweepResult
     from plushsense.experiments.sweep.run import SweepPreview
+    from plushsense.reports.table import Row
 
-_GRID_OPTIONS = ("split", "epochs", "share", "eta", "max_parameters", "max_state_bytes", "max_macs_per_step")
+_KEYS = ("split", "epochs", "share", "eta", "max_parameters", "max_state_bytes", "max_macs_per_step")
+_MOST_SEEDS = 1000
 # Settings that the lines above them already name.
 _NAMED = ("name", "architectures", "filters", "split", "seeds")
 
 
 def run_sweep(args: argparse.Namespace) -> int:
-    from plushsense.experiments.sweep.run import preview, sweep
+    from plushsense.experiments.sweep.run import SweepSpec, preview, sweep
 
-    changes = grid_changes(args, *_GRID_OPTIONS) | options(args, "keep_predictions")
-    # Without the option, the grid's file decides.
-    changes["halving"] = args.halving or None
+    spec = SweepSpec(
+        args.grid, _changes(args), args.out, args.force, args.workers or 0, args.cluster, args.keep_predictions
+    )
     if args.dry_run:
-        plan = preview(args.dataset, args.grid, warn=warn, **changes)
+        plan = preview(args.dataset, spec, warn=warn)
         emit(args, plan.to_json(), _preview_lines(plan))
         return 1 if plan.problems else 0
-    done = sweep(args.dataset, args.grid, **work_options(args), display=True, warn=warn, **changes)
+    done = sweep(args.dataset, spec, display=True, warn=warn)
     say(f"written: {done.out}; make a page of it with  plushsense report {done.out}")
-    emit(args, {**done.to_json(), "out": str(done.out)}, _result_lines(done))
-    return 1 if done.trainings_lost else 0
+    emit(args, {**done.head, "out": str(done.out)}, _result_lines(done))
+    return 1 if done.head["trainings_lost"] else 0
+
+
+def _changes(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the values of the options that change a grid."""
+    changes: dict[str, Any] = {}
+    for text in args.set:
+        key, equals, value = text.partition("=")
+        if not equals or key.strip() in changes:
+            raise ConfigError(
+                f"--set was given '{text}': KEY=VALUE is accepted, with a key of a grid file, each at most once."
+            )
+        changes[key.strip()] = value.strip()
+    if args.seeds is not None and args.seeds > _MOST_SEEDS:
+        raise ConfigError(f"--seeds is {args.seeds}: accepted are 1 to {_MOST_SEEDS} seeds.")
+    # ``--seeds 0`` gives an empty tuple, which is reported with the other problems of the grid.
+    seeds = None if args.seeds is None else tuple(range(args.seeds))
+    given = {**options(args, *_KEYS), "seeds": seeds, "halving": args.halving or None}
+    return changes | {key: value for key, value in given.items() if value is not None}
 
 
 def _preview_lines(preview: SweepPreview) -> list[str]:
@@ -77,52 +97,29 @@ def _text(value: object) -> str:
 
 def _result_lines(done: SweepResult) -> list[str]:
     """Format the best trials of a sweep as text."""
-    head = done.head
-    mark = " (leaky)" if head.leaky else ""
-    out = marks({"simulated": head.simulated, "leaky": head.leaky})
+    head, mark = done.head, " (leaky)" * done.leaky
+    out = marks(head)
     out.append(
-        f"grid {head.name}, split {head.split}, context {head.context}: {len(done.done)} of "
-        f"{plural(len(done.results), 'trial')} done ({done.resumed} from before)\n"
+        f"grid {head['name']}, split {head['split']}, context {head['context']}: {head['done']} of "
+        f"{plural(head['trials'], 'trial')} done ({head['resumed']} from before)\n"
     )
-    out.append(done.best_table().text())
-    picked = done.best_on_validation
-    if picked is not None:
-        row = picked.row()
+    out.append(done.best_table(terminal=True).text())
+    if (row := head["best_on_validation"]) is not None:
         out.append("")
         out.append(
-            f"The best of {len(done.done)} on the test windows is partly luck. Chosen by validation macro-F1 it is "
+            f"The best of {head['done']} on the test windows is partly luck. Chosen by validation macro-F1 it is "
             f"{row['arch']} {row['filters']}, {row['epochs']} epochs, batch {row['batch_asked']}: accuracy "
             f"{figure(row['accuracy'])}, macro-F1 {figure(row['macro_f1'])}{mark}."
         )
-    if done.halving is not None:
-        out += ["", *_halving_lines(done.halving, mark)]
-    return out + [f"failed: {one.arch} {one.filters}, {one.epochs} epochs: {one.why}" for one in done.failed]
+    if "halving" in head:
+        out += ["", *_halving_lines(head["halving"], mark)]
+    lost = (f"failed: {one['arch']} {one['filters']}, {one['epochs']} epochs: {one['why']}" for one in head["failed"])
+    return [*out, *lost]
 
 
-def _halving_lines(halving: Halving, mark: str) -> list[str]:
-    """Format halving as text: the rungs, the best network, the cost, and the command that trains it."""
-    found, costs = halving.found, halving.costs
-    best, small = halving.winner, halving.smallest_equal
-    lines = [*_rung_lines(halving, mark), ""]
-    lines.append(
-        f"Best: {best.trial.arch.symbol} with {best.trial.network[1]}, macro-F1 {figure(best.mean('macro_f1'))}{mark}. "
-        f"It is the best of {len(halving.networks)} on these people: slightly too high."
-    )
-    if small is not best:
-        lines.append(
-            f"Smallest within one standard error: {small.trial.arch.symbol} with {small.trial.network[1]}, "
-            f"{small.trial.arch.parameters:,} parameters, macro-F1 {figure(small.mean('macro_f1'))}{mark}."
-        )
-    lines.append(
-        f"Cost: {found.spent:.2e} multiply-accumulates of training, {found.spent / costs.whole:.1%} of the whole "
-        f"grid's {costs.whole:.2e} (bound {costs.share:.0%})."
-    )
-    return [*lines, f"Train it on everybody:\n  {halving.command}"]
-
-
-def _rung_lines(halving: Halving, mark: str) -> list[str]:
-    """Format a row for each network, the longest trained first, with its score after each rung and why it stopped."""
-    rungs = halving.to_json()["rungs"]
+def _halving_lines(halving: Row, mark: str) -> list[str]:
+    """Format halving as text: its rungs by network, the best network, the cost, and what to do next."""
+    rungs, best, small, cost = (halving[key] for key in ("rungs", "winner", "smallest_equal", "cost"))
     rows: dict[tuple[str, str, str], list[object]] = {}
     for i, rung in enumerate(rungs):
         for n in rung["networks"]:
@@ -131,15 +128,25 @@ def _rung_lines(halving: Halving, mark: str) -> list[str]:
     # Sort networks by the last rung that they reached, in the order of that rung.
     names = [(n["arch"], n["filters"], n["batch_asked"]) for rung in reversed(rungs) for n in rung["networks"]]
     heads = ("network", "filters", "batch", *(f"after {rung['epochs']}" for rung in rungs), "")
-    return [
+    lines = [
         f"macro-F1{mark} after each rung of epochs",
         table(heads, [(*name, *rows[name]) for name in dict.fromkeys(names)]),
-        *(_cost_line(finished, halving.costs.whole) for finished in halving.found.rungs),
+        *(
+            f"up to epoch {rung['epochs']}: {plural(rung['entered'], 'network')}, {rung['share']:.1%} of the grid's "
+            f"cost, standard error of a difference {figure(rung['standard_error'])}"
+            for rung in rungs
+        ),
+        "",
+        f"Best: {best['arch']} with {best['filters']}, macro-F1 {figure(best['macro_f1'])}{mark}. "
+        f"It is the best of {rungs[0]['entered']} on these people: slightly too high.",
     ]
-
-
-def _cost_line(finished: RungResult, whole: float) -> str:
-    rung, error = finished.rung, finished.error
-    apart = "" if error is None else f", standard error of a difference {figure(error)}"
-    entered = plural(len(rung.entered), "network")
-    return f"up to epoch {rung.epochs}: {entered}, {rung.cost / whole:.1%} of the grid's cost{apart}"
+    if small["trial"] != best["trial"]:
+        lines.append(
+            f"Smallest within one standard error: {small['arch']} with {small['filters']}, "
+            f"{small['parameters']:,} parameters, macro-F1 {figure(small['macro_f1'])}{mark}."
+        )
+    lines.append(
+        f"Cost: {cost['macs']:.2e} multiply-accumulates of training, {cost['share']:.1%} of the whole "
+        f"grid's {cost['grid_macs']:.2e} (bound {cost['bound_share']:.0%})."
+    )
+    return [*lines, f"Train it on everybody:\n  {halving['command']}"]

@@ -7,7 +7,7 @@ import itertools
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -17,13 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest, python_warning
-from plushsense.core.files import temporary_folder
 from plushsense.dataset.files import CACHE
-from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.index import as_dataset
-from plushsense.dataset.store import HEAD, Dataset
-from plushsense.deploy.quantize import calibration, integer_network, integer_probabilities, refuse_undeployable
+from plushsense.dataset.store import Dataset
+from plushsense.deploy.quantize import calibration
 from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
+from plushsense.experiments.recordings import opened
 from plushsense.jobs.journal import Result
 from plushsense.jobs.pool import JobsSpec, Report
 from plushsense.jobs.study import Progress, StudyPart, StudyResults, run_study
@@ -45,50 +43,21 @@ from plushsense.workflow.reporting import journal_of, keep_bundle
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
 """Returns the probabilities (N, K) of windows."""
-Predictors = Mapping[str, Predictor]
-"""A predictor for each engine, "float" first."""
-
 _SCORES = ("accuracy", "macro_f1")
 
 
 @dataclass(frozen=True)
-class HeldOutPerson:
-    """A person with a network that was not trained on them.
-
-    ``adapt`` takes the windows of the recordings to adapt to; it returns the adapted predictors, or None where the
-    network stays as it is.
-    """
-
-    subject: str
-    predictors: Predictors
-    adapt: Callable[[WindowSet], Predictors | None]
-
-
-@dataclass(frozen=True)
-class ChoiceSpec:
-    """Which recordings a network is adapted to.
-
-    The choices are all sets of ``use`` numbers, the same for all gestures (10 of 5 recordings), where the recordings of
-    a gesture are numbered by time; the first choice is the first recordings of each gesture. ``random`` further choices
-    are drawn for each gesture on its own, with ``seed``.
-    """
-
-    use: int = 2
-    random: int = 0
-    seed: int = 0
-
-
-@dataclass(frozen=True)
 class PersonGain:
-    """What adaptation changed for one person: means over the ``choices``.
+    """What adaptation changed for one person: means over the ``choices`` of recordings.
 
-    ``right_change`` counts correct recordings, after minus before; ``choices_worse`` the choices that lost more than
-    one. ``scores`` has for accuracy and macro-F1 the value ``before`` and ``after``, and the gain of the ``first``
-    choice.
+    ``refused`` counts the choices that left the network as it is. ``right_change`` counts correct recordings, after
+    minus before; ``choices_worse`` the choices that lost more than one. ``scores`` has for accuracy and macro-F1 the
+    value ``before`` and ``after``, and the gain of the ``first`` choice.
     """
 
     subject: str
     choices: int
+    refused: int
     recordings: float
     right_change: float
     right_change_worst: int
@@ -101,190 +70,68 @@ class PersonGain:
         return row | {f"{score}_{when}": value for score, at in self.scores.items() for when, value in at.items()}
 
 
-@dataclass(frozen=True)
-class PersonTrial:
-    """The outcome of all choices for one person.
-
-    Attributes:
-        refused: of each choice, whether the network stayed as it was.
-        gains: by engine.
-        agreement: of each choice, the share of the windows on which the engines agree, before and after.
-    """
-
-    refused: tuple[bool, ...]
-    gains: Mapping[str, PersonGain]
-    agreement: tuple[tuple[float, float], ...]
-
-    @classmethod
-    def from_journal(cls, row: Mapping[str, Any]) -> PersonTrial:
-        """Restore what ``asdict`` returned."""
-        gains = {name: PersonGain(**gain) for name, gain in row["gains"].items()}
-        return cls(tuple(row["refused"]), gains, tuple((one, other) for one, other in row["agreement"]))
-
-
-@dataclass(frozen=True)
-class EngineGains:
-    """The gains of one engine over people.
-
-    ``scores``: of accuracy and macro-F1 ``before``, ``after``, ``gain``, and ``first``, the gain of the first choice.
-    ``right``: correct recordings after minus before: ``mean``, ``worst_mean`` of a person, ``worst`` of a choice,
-    ``worse_people`` (less by more than one on average), ``worse_choices`` (share of choices).
-    """
-
-    scores: Mapping[str, Mapping[str, Any]]
-    right: Mapping[str, float]
-    people: tuple[PersonGain, ...]
-
-    @classmethod
-    def over(cls, people: Sequence[PersonGain]) -> EngineGains:
-        scores = {}
-        for score in _SCORES:
-            before, after, first = (
-                np.array([row.scores[score][when] for row in people]) for when in ("before", "after", "first")
-            )
-            scores[score] = {
-                "before": metrics.summary(before).to_json(),
-                "after": metrics.summary(after).to_json(),
-                "gain": metrics.summary(after - before).to_json(),
-                "first": metrics.summary(first).to_json(),
-            }
-        changes = [row.right_change for row in people]
-        right = {
-            "mean": float(np.mean(changes)),
-            "worst_mean": min(changes),
-            "worst": min(row.right_change_worst for row in people),
-            "worse_people": sum(change < -1 for change in changes),
-            "worse_choices": sum(row.choices_worse for row in people) / sum(row.choices for row in people),
-        }
-        return cls(scores, right, tuple(people))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return {**self.scores, "right": dict(self.right), "people": [row.to_json() for row in self.people]}
-
-
-@dataclass(frozen=True)
-class AdaptationScores:
-    """Scores of people before and after adaptation.
-
-    Attributes:
-        choices: number of them in all; ``refused``: share of them in which the network stayed as it was.
-        agreement: share of the test windows on which the engines agree, before and after; None with one engine.
-    """
-
-    context: str
-    choice: ChoiceSpec
-    choices: int
-    refused: float
-    engines: Mapping[str, EngineGains]
-    agreement: Mapping[str, float] | None
-
-    @classmethod
-    def over(cls, context: str, choice: ChoiceSpec, trials: Sequence[PersonTrial]) -> AdaptationScores:
-        """Return the scores over the trials of all people.
-
-        Raises:
-            BadInput: when nobody has more than ``choice.use`` recordings of a gesture.
-        """
-        names = list(dict.fromkeys(name for trial in trials for name in trial.gains))
-        if not names:
-            raise BadInput(
-                f"Nobody has more than {choice.use} recordings of a gesture (--use), so none is left to test on."
-            )
-        refused = [one for trial in trials for one in trial.refused]
-        same = [pair for trial in trials for pair in trial.agreement]
-        return cls(
-            context,
-            choice,
-            len(refused),
-            float(np.mean(refused)),
-            {name: EngineGains.over([t.gains[name] for t in trials if name in t.gains]) for name in names},
-            {when: float(np.mean([pair[i] for pair in same])) for i, when in enumerate(("before", "after"))}
-            if same
-            else None,
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return {
-            "context": self.context,
-            "use": self.choice.use,
-            "random": self.choice.random,
-            "choices": self.choices,
-            "refused": self.refused,
-            "engines": {name: gains.to_json() for name, gains in self.engines.items()},
-            "agreement": self.agreement,
-        }
-
-
 def try_adapting(
-    windows: WindowSet, person: HeldOutPerson, times: Mapping[str, int], choice: ChoiceSpec
-) -> PersonTrial:
+    windows: WindowSet,
+    subject: str,
+    predict: Predictor,
+    adapt: Callable[[WindowSet], Predictor | None],
+    times: Mapping[str, int],
+    use: int,
+) -> PersonGain | None:
     """Adapt to each choice of one person's recordings, and compare the scores on the others before and after.
+
+    The choices are all sets of ``use`` numbers, the same for all gestures (10 of 5 recordings), where the recordings of
+    a gesture are numbered by time; the first choice is the first recordings of each gesture.
 
     Args:
         windows: of everybody.
+        predict: the network, which was not trained on ``subject``.
+        adapt: returns the network adapted to windows, or None where it stays as it is.
         times: when each recording was made, by its id.
+
+    Returns:
+        None where no choice leaves a recording to test on.
     """
-    mine = windows.take(np.flatnonzero(windows.subject == person.subject))
-    tried: dict[str, list[_Change]] = {name: [] for name in person.predictors}
-    refused: list[bool] = []
-    same: list[tuple[float, float]] = []
-    for chosen in _choices(mine, times, choice):
+    mine = windows.take(np.flatnonzero(windows.subject == subject))
+    refused, recordings, counts = 0, list[int](), list[tuple[metrics.Counts, metrics.Counts]]()
+    for chosen in _choices(mine, times, use):
         own, test = _divide(mine, chosen)
         if not len(own) or not len(test):
             continue
-        adapted = person.adapt(own)
-        refused.append(adapted is None)
-        before = {name: predict(test) for name, predict in person.predictors.items()}
-        after = before if adapted is None else {name: predict(test) for name, predict in adapted.items()}
-        for name in before:
-            tried[name].append(_Change.of(test, before[name], after[name]))
-        if len(before) > 1:
-            same.append((_agreement(list(before.values())), _agreement(list(after.values()))))
-    gains = {name: _gain(person.subject, changes) for name, changes in tried.items() if changes}
-    return PersonTrial(tuple(refused), gains, tuple(same))
+        adapted = adapt(own)
+        refused += adapted is None
+        before = _votes(test, predict)
+        counts.append((before, before if adapted is None else _votes(test, adapted)))
+        recordings.append(len(np.unique(test.recording)))
+    if not counts:
+        return None
+    right = [int(np.trace(after)) - int(np.trace(before)) for before, after in counts]
+    scores = {}
+    for name in _SCORES:
+        pairs = np.array([[getattr(metrics, name)(one) for one in pair] for pair in counts])
+        first = float(pairs[0, 1] - pairs[0, 0])
+        scores[name] = {"before": float(pairs[:, 0].mean()), "after": float(pairs[:, 1].mean()), "first": first}
+    worse = sum(change < -1 for change in right)
+    return PersonGain(
+        *(subject, len(counts), refused, float(np.mean(recordings)), float(np.mean(right)), min(right), worse, scores)
+    )
 
 
-@dataclass(frozen=True)
-class _Change:
-    """Tested recordings of one choice, how many were correct, and both scores, before and after."""
-
-    recordings: int
-    right: tuple[int, int]
-    accuracy: tuple[float, float]
-    macro_f1: tuple[float, float]
-
-    @classmethod
-    def of(cls, test: WindowSet, *probabilities: NDArray[np.floating[Any]]) -> _Change:
-        ids, first = np.unique(test.recording, return_index=True)
-        truth = test.y[first]
-        counts = [
-            metrics.confusion(truth, metrics.vote(each, test.recording)[1], len(test.labels)) for each in probabilities
-        ]
-        before, after = counts
-        return cls(
-            len(ids),
-            (int(np.trace(before)), int(np.trace(after))),
-            (metrics.accuracy(before), metrics.accuracy(after)),
-            (metrics.macro_f1(before), metrics.macro_f1(after)),
-        )
+def _votes(test: WindowSet, predict: Predictor) -> metrics.Counts:
+    """Return the confusion matrix of the recordings, each of which its windows vote on."""
+    _, first = np.unique(test.recording, return_index=True)
+    return metrics.confusion(test.y[first], metrics.vote(predict(test), test.recording)[1], len(test.labels))
 
 
-def _choices(windows: WindowSet, times: Mapping[str, int], choice: ChoiceSpec) -> Iterator[set[int]]:
+def _choices(windows: WindowSet, times: Mapping[str, int], use: int) -> Iterator[set[int]]:
     """Yield the recordings to adapt to, as numbers of ``windows.recording``."""
-    by_class = []
-    for k in np.unique(windows.y):
-        mine = sorted(
-            {int(r) for r in windows.recording[windows.y == k]},
-            key=lambda r: (times.get(windows.recording_ids[r], 0), windows.recording_ids[r]),
-        )
-        by_class.append(mine)
-    for numbers in itertools.combinations(range(max(map(len, by_class), default=0)), choice.use):
+    ids = windows.recording_ids
+    by_class = [
+        sorted(set(windows.recording[windows.y == k].tolist()), key=lambda r: (times.get(ids[r], 0), ids[r]))
+        for k in np.unique(windows.y)
+    ]
+    for numbers in itertools.combinations(range(max(map(len, by_class), default=0)), use):
         yield {mine[n] for mine in by_class for n in numbers if n < len(mine)}
-    draw = np.random.default_rng(choice.seed)
-    for _ in range(choice.random):
-        yield {int(r) for mine in by_class for r in draw.permutation(mine)[: choice.use]}
 
 
 def _divide(windows: WindowSet, chosen: set[int]) -> tuple[WindowSet, WindowSet]:
@@ -293,29 +140,6 @@ def _divide(windows: WindowSet, chosen: set[int]) -> tuple[WindowSet, WindowSet]
     test = windows.take(np.flatnonzero(~adapts))
     keep = purge(windows.stream, windows.window_rows, test.stream, test.recording_rows)
     return windows.take(np.flatnonzero(adapts & keep)), test
-
-
-def _agreement(probabilities: list[NDArray[np.floating[Any]]]) -> float:
-    one, other = (each.argmax(axis=1) for each in probabilities[:2])
-    return float((one == other).mean())
-
-
-def _gain(subject: str, changes: list[_Change]) -> PersonGain:
-    difference = [c.right[1] - c.right[0] for c in changes]
-    scores = {}
-    for score in _SCORES:
-        pairs = np.array([getattr(c, score) for c in changes])
-        first = float(pairs[0, 1] - pairs[0, 0])
-        scores[score] = {"before": float(pairs[:, 0].mean()), "after": float(pairs[:, 1].mean()), "first": first}
-    return PersonGain(
-        subject,
-        len(changes),
-        float(np.mean([c.recordings for c in changes])),
-        float(np.mean(difference)),
-        min(difference),
-        sum(d < -1 for d in difference),
-        scores,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,8 +227,7 @@ def adapt(
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     if (before := given.adapted_to) is not None:
         warn(f"the bundle is adapted to {before}: it is adapted again from its original")
-    with temporary_folder() as place:
-        dataset = _dataset(recordings, given, place)
+    with opened(recordings, given.layout, given.gestures) as dataset:
         person = _person(dataset, subject)
         dataset = dataset.with_inputs(given.layout).with_gestures(given.gestures)
         _same_layout(given, dataset)
@@ -412,37 +235,25 @@ def adapt(
         own, left_out = _recordings_of(dataset, person, given, warn)
         windows = windows_for(own, given.arch, whole_gestures(given.windowing), given.gestures, warn)
         times = {r.id: r.epoch_ms for r in own.recordings}
-    adapting, test = windows, None
-    if use is not None:
-        everything = set(windows.recording.tolist())
-        adapting, test = _divide(windows, next(_choices(windows, times, ChoiceSpec(use)), everything))
-        if not len(test):
-            raise BadInput(
-                f"No recording of {person} is left to test on: {use} of each gesture are used to adapt; use fewer."
-            )
-    done = personalise(given, adapting.integers, adapting.y, adapting.recording, subject=person, spec=spec)
-    for label in done.without:
-        warn(f"{label}: fewer than {spec.least} recordings, so the network recognises it as before")
-    tested = None
-    if test is not None:
-        original = restore_original(given) if before is not None else given
-        predictors = (_float_predictor(original), _float_predictor(done.bundle if done.accepted else original))
-        one, other = (judge(predict(test), test.y, test.recording).scores for predict in predictors)
-        tested = (one, other)
-    if not dataset.path.is_relative_to(place):  # the one made of a folder is gone by now
+        adapting, test = windows, None
+        if use is not None:
+            everything = set(windows.recording.tolist())
+            adapting, test = _divide(windows, next(_choices(windows, times, use), everything))
+            if not len(test):
+                raise BadInput(
+                    f"No recording of {person} is left to test on: {use} of each gesture are used to adapt; use fewer."
+                )
+        done = personalise(given, adapting.integers, adapting.y, adapting.recording, subject=person, spec=spec)
+        for label in done.without:
+            warn(f"{label}: fewer than {spec.least} recordings, so the network recognises it as before")
+        tested = None
+        if test is not None:
+            original = restore_original(given) if before is not None else given
+            predictors = (_predictor(original), _predictor(done.bundle if done.accepted else original))
+            one, other = (judge(predict(test), test.y, test.recording).scores for predict in predictors)
+            tested = (one, other)
         dataset.generation.check()
     return Adapted(done, person, use, tested, left_out, dataset.head.simulated)
-
-
-def _dataset(recordings: Dataset | str | os.PathLike[str], bundle: Bundle, place: Path) -> Dataset:
-    """Return the data set, or one made of a recorder's folder in the folder ``place``."""
-    if isinstance(recordings, Dataset) or (Path(recordings) / HEAD).is_file():
-        return as_dataset(recordings)
-    if not Path(recordings).exists():
-        raise DatasetError(f"There is no folder '{recordings}': give a data set, or a person's folder of recordings.")
-    return import_recordings(
-        Path(recordings), place / "DS", layout=bundle.layout, gestures=bundle.gestures, adopt_proposals=False
-    ).dataset
 
 
 def _person(dataset: Dataset, subject: str | None) -> str:
@@ -461,11 +272,8 @@ def _person(dataset: Dataset, subject: str | None) -> str:
 
 def _same_layout(bundle: Bundle, dataset: Dataset) -> None:
     one, other = bundle.layout, dataset.layout
-
-    def signature(layout: Any) -> tuple[Any, ...]:
-        return tuple((c.name, c.unit, c.step) for c in layout.channels), layout.inputs, layout.period_us
-
-    if signature(one) != signature(other):
+    signatures = [([(c.name, c.unit, c.step) for c in at.channels], at.inputs, at.period_us) for at in (one, other)]
+    if signatures[0] != signatures[1]:
         raise DatasetError(
             "'{dataset}' has the layout '{other}', the bundle '{one}': a bundle can only be adapted to recordings of "
             "the sensors that it reads.",
@@ -500,35 +308,62 @@ def _recordings_of(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) ->
     return Dataset(dataset.path, dataset.head, known, dataset.streams), left_out
 
 
-def _float_predictor(bundle: Bundle) -> Predictor:
+def _predictor(bundle: Bundle) -> Predictor:
     network, scaler = bundle.network(), bundle.scaler
     return lambda windows: network.probabilities(scaler.apply(windows.integers))
 
 
-def _predictors(bundle: Bundle, int8: bool) -> dict[str, Predictor]:
-    predictors = {"float": _float_predictor(bundle)}
-    if int8:
-        network = integer_network(bundle)
-        predictors["int8"] = lambda windows: integer_probabilities(network, windows.integers)
-    return predictors
-
-
 @dataclass(frozen=True)
 class AdaptingResult:
-    """The result of `evaluate_adapting`."""
+    """The result of `evaluate_adapting`: what adaptation to ``use`` recordings of each gesture changed for people."""
 
     split: str
     simulated: bool
+    context: str
+    use: int
     spec: PersonalSpec
-    scores: AdaptationScores
+    people: tuple[PersonGain, ...]
+
+    @property
+    def choices(self) -> int:
+        """Number of choices of recordings of all people."""
+        return sum(row.choices for row in self.people)
+
+    @property
+    def refused(self) -> float:
+        """Share of the choices that left the network as it is."""
+        return sum(row.refused for row in self.people) / self.choices
+
+    def score(self, name: str) -> dict[str, metrics.Summary]:
+        """Return a score ``before``, ``after``, their difference ``gain``, and ``first``, that of the first choice."""
+        before, after, first = (
+            np.array([row.scores[name][when] for row in self.people]) for when in ("before", "after", "first")
+        )
+        values = {"before": before, "after": after, "gain": after - before, "first": first}
+        return {when: metrics.summary(value) for when, value in values.items()}
+
+    @property
+    def right(self) -> dict[str, float]:
+        """Correct recordings, after minus before: the ``mean``, that of the worst person, the ``worst`` choice, people
+        who lost more than one on average, and the share of such choices.
+        """
+        changes = [row.right_change for row in self.people]
+        return {
+            "mean": float(np.mean(changes)),
+            "worst_mean": min(changes),
+            "worst": min(row.right_change_worst for row in self.people),
+            "worse_people": sum(change < -1 for change in changes),
+            "worse_choices": sum(row.choices_worse for row in self.people) / self.choices,
+        }
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         return {
-            "split": self.split,
-            "simulated": self.simulated,
+            **{key: getattr(self, key) for key in ("split", "simulated", "context", "use", "choices", "refused")},
             "spec": asdict(self.spec),
-            **self.scores.to_json(),
+            **{name: {when: one.to_json() for when, one in self.score(name).items()} for name in _SCORES},
+            "right": self.right,
+            "people": [row.to_json() for row in self.people],
         }
 
 
@@ -538,9 +373,6 @@ def evaluate_adapting(
     *,
     split: str = "leave-one-subject-out",
     use: int = 2,
-    random: int = 0,
-    int8: bool = False,
-    spec: PersonalSpec | None = None,
     progress: Progress | None = None,
     warn: Warn = python_warning,
     **settings: Any,
@@ -552,44 +384,51 @@ def evaluate_adapting(
 
     Args:
         config, settings: as for `plushsense.train`; also ``workers``.
-        use, random: as for `ChoiceSpec`.
-        int8: also score the deployed networks, before and after.
+        use: number of recordings of each gesture to adapt to; see `try_adapting`.
+
+    Raises:
+        ConfigError: for a split that does not keep people apart, or too small a ``use``.
+        BadInput: when nobody has more than ``use`` recordings of a gesture.
     """
     run = prepare(dataset, config or from_settings(**settings), warn)
-    spec = spec or PersonalSpec()
-    if use < spec.least or random < 0:
-        raise ConfigError(f"--use {use}, --choices {random}: accepted are {spec.least} and more, 0 and more.")
+    spec = PersonalSpec()
+    if use < spec.least:
+        raise ConfigError(f"--use {use} is too few: accepted are {spec.least} and more recordings of each gesture.")
     division = parse_split(split)
     if not division.separates_people:
         raise ConfigError(f"The split {split} does not keep people apart: use leave-one-subject-out or by-subject:5.")
-    if int8:
-        refuse_undeployable(run.network)
     windows = windows_for(run.dataset, run.network, run.windows, run.gestures, warn)
-    choice = ChoiceSpec(use, random, run.evaluation.seed)
-    work = _FoldWork(run, choice, spec, int8)
-    context = context_of(windows)
+    work = _FoldWork(run, use, spec)
 
-    def summarise(study: StudyResults) -> AdaptationScores:
-        trials = [PersonTrial.from_journal(row) for result in study.results for row in result["people"]]
-        return AdaptationScores.over(context, choice, trials)
+    def summarise(study: StudyResults) -> AdaptingResult:
+        people = tuple(PersonGain(**row) for result in study.results for row in result["people"])
+        if not people:
+            raise BadInput(f"Nobody has more than {use} recordings of a gesture (--use), so none is left to test on.")
+        simulated = run.dataset.head.simulated
+        return AdaptingResult(division.text, simulated, context_of(windows), use, spec, people)
 
-    scores = run_study(
+    return run_study(
         [
             StudyPart(fold.name, {"fold": fold_fingerprint(fold)}, fold)
             for fold in fold_windows(windows, windows, division, run.evaluation.seed)
         ],
         work,
         summarise,
-        key=work.key(windows),
+        key={
+            "version": _VERSION,
+            **work.network_key(windows),
+            "use": use,
+            "spec": asdict(spec),
+            "times": sorted((r.id, r.epoch_ms) for r in run.dataset.recordings),
+        },
         shared=windows,
         spec=JobsSpec(run.evaluation.processes, journal=journal_of(run.dataset, _FOLDER)),
         progress=progress,
     )
-    return AdaptingResult(division.text, run.dataset.head.simulated, spec, scores)
 
 
 # Part of every job's id: increase it when the meaning of a stored fold changes.
-_VERSION = 1
+_VERSION = 2
 _FOLDER = "adapting"
 
 
@@ -598,17 +437,10 @@ class _FoldWork:
     """The work of one fold: train its network, or load it, and adapt it to each person who was left out."""
 
     run: Run
-    choice: ChoiceSpec
+    use: int
     spec: PersonalSpec
-    int8: bool
 
-    def key(self, windows: WindowSet) -> dict[str, Any]:
-        """Return what the result of every fold depends on."""
-        times = sorted((r.id, r.epoch_ms) for r in self.run.dataset.recordings)
-        tried = {"choice": vars(self.choice), "spec": asdict(self.spec), "int8": self.int8, "times": times}
-        return {"version": _VERSION, **self._network_key(windows), "tried": tried}
-
-    def _network_key(self, windows: WindowSet) -> dict[str, Any]:
+    def network_key(self, windows: WindowSet) -> dict[str, Any]:
         return {
             "windows": windows_fingerprint(windows),
             "arch": self.run.network.to_dict(),
@@ -618,18 +450,23 @@ class _FoldWork:
 
     def __call__(self, windows: WindowSet, task: Fold, report: Report, /) -> Result:
         bundle = self._bundle_of(windows, task, report)
-        predictors = _predictors(bundle, self.int8)
         times = {r.id: r.epoch_ms for r in self.run.dataset.recordings}
-        people = [
-            HeldOutPerson(who, predictors, partial(_adapt_to, bundle, who, self.spec, self.int8))
-            for who in task.subjects
-        ]
-        return {"people": [asdict(try_adapting(windows, person, times, self.choice)) for person in people]}
+        predict = _predictor(bundle)
+
+        def adapt_to(person: str, own: WindowSet) -> Predictor | None:
+            try:
+                done = personalise(bundle, own.integers, own.y, own.recording, subject=person, spec=self.spec)
+            except BadInput:
+                return None  # too few recordings
+            return _predictor(done.bundle) if done.accepted else None
+
+        tried = (try_adapting(windows, p, predict, partial(adapt_to, p), times, self.use) for p in task.subjects)
+        return {"people": [asdict(gain) for gain in tried if gain is not None]}
 
     def _bundle_of(self, windows: WindowSet, fold: Fold, report: Report) -> Bundle:
         """Return the fold's network from the cache, or train it."""
         run, dataset, arch = self.run, self.run.dataset, self.run.network
-        made = json.dumps({**self._network_key(windows), "fold": fold_fingerprint(fold)}, sort_keys=True)
+        made = json.dumps({**self.network_key(windows), "fold": fold_fingerprint(fold)}, sort_keys=True)
         path = dataset.path / CACHE / _FOLDER / f"{hashlib.sha256(made.encode()).hexdigest()[:32]}.plush"
         if path.exists():
             return Bundle.load(path)
@@ -657,12 +494,3 @@ class _FoldWork:
         )
         keep_bundle(bundle, path, dataset)
         return bundle
-
-
-def _adapt_to(bundle: Bundle, person: str, spec: PersonalSpec, int8: bool, own: WindowSet) -> Predictors | None:
-    """Return the predictors of the bundle adapted to windows of a person; None where it stays as it is."""
-    try:
-        done = personalise(bundle, own.integers, own.y, own.recording, subject=person, spec=spec)
-    except BadInput:
-        return None  # too few recordings
-    return _predictors(done.bundle, int8) if done.accepted else None

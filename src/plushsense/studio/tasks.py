@@ -412,11 +412,11 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Run a sweep; return the folder ``out`` and main values of the result, or the preview for a dry run."""
-    from plushsense.experiments.sweep.run import SweepProgress, preview, sweep
+    from plushsense.experiments.sweep.run import SweepProgress, SweepSpec, preview, sweep
 
-    changes = dict(spec.get("changes", {}))
+    asked = SweepSpec(spec["grid"], spec.get("changes", {}))
     if spec.get("dry"):
-        return preview(spec["dataset"], spec["grid"], measure=True, warn=reporter.warn, **changes).to_json()
+        return preview(spec["dataset"], asked, measure=True, warn=reporter.warn).to_json()
     reporter.progress(stage="reading", share=0.0)
     clock = Clock()
 
@@ -429,14 +429,14 @@ def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         share = min(1.0, at.share)
         reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(share))
 
-    done = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
-    for lost in done.failed:
-        network = f"{lost.arch} {lost.filters}"
+    done = sweep(spec["dataset"], asked, progress=training, warn=reporter.warn)
+    for lost in done.head["failed"]:
+        network = f"{lost['arch']} {lost['filters']}"
         reporter.warn(Message("The network {network} was given up, because its training failed.", network=network))
     keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
-    stored = done.to_json()
-    halving = {key: stored["halving"][key] for key in ("winner", "smallest_equal")} if done.halving else {}
-    return {"out": str(done.out), **{key: stored[key] for key in keys}, **halving}
+    halving = done.head.get("halving", {})
+    found = {key: halving[key] for key in ("winner", "smallest_equal") if key in halving}
+    return {"out": str(done.out), **{key: done.head[key] for key in keys}, **found}
 
 
 def run_profile(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:

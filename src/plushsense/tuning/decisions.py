@@ -51,14 +51,6 @@ class HealthFit:
     widened: tuple[str, ...]
     still_ms: int
 
-    def described(self) -> dict[str, Any]:
-        """Return the amount of data and what was found in it, for the report of a bundle."""
-        return {
-            "hours": round(self.seconds / 3600, 3),
-            "end_stops": list(self.widened),
-            "longest_still_ms": self.still_ms,
-        }
-
 
 def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettings | None = None) -> HealthFit:
     """Fit limits with which the sensors of ``subjects`` are never at fault.
@@ -236,7 +228,12 @@ def fit_decisions(
     if len(labelled.truth):
         spec = _fit_answers(labelled, spec, bundle.gestures, aims, keep)
         report["answers"] = _answers(labelled, spec, aims, bool(streams))
-    report["health"] = {"people": len(everybody), **health.described()}
+    report["health"] = {
+        "people": len(everybody),
+        "hours": round(health.seconds / 3600, 3),
+        "end_stops": list(health.widened),
+        "longest_still_ms": health.still_ms,
+    }
     return replace(spec, fitted=report | gate)
 
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +16,6 @@ from plushsense.jobs.journal import Journal
 from plushsense.jobs.pool import JobsSpec
 from plushsense.jobs.progress import JobProgress
 from plushsense.windows.cut import WindowSet
-
-HERE = Path(__file__).parents[2]
-
 from support.fakes import LABELS, study
 
 pytestmark = [pytest.mark.usefixtures("scikit_learn"), pytest.mark.apart("models")]
@@ -34,13 +28,11 @@ class Known:
     """Knows a recording that it was trained on, and nothing else; leaves a mark for each fit."""
 
     folder: str
-    pause: float = 0.0
 
     def __call__(self, train: WindowSet, validation: WindowSet, /) -> KnownReader:
         assert len(validation)
         with Path(self.folder, "fits").open("a") as file:
             file.write("x")
-        time.sleep(self.pause)
         return KnownReader(tuple(np.unique(train.integers[:, 1, 0]).tolist()))
 
 
@@ -66,8 +58,8 @@ class Misshapen:
         return self if len(sets) == 2 else np.zeros((1, 1), dtype=np.float32)
 
 
-def known(folder: Path, name: str = "known", pause: float = 0.0, **key: Any) -> Contender:
-    return Contender(name, f"the {name} one", "windows", False, Known(str(folder), pause), key)
+def known(folder: Path, name: str = "known", **key: Any) -> Contender:
+    return Contender(name, f"the {name} one", "windows", False, Known(str(folder)), key)
 
 
 def fits(folder: Path) -> int:
@@ -107,34 +99,6 @@ def test_finished_fits_are_kept_and_a_changed_key_is_another_job(tmp_path: Path)
     assert fits(tmp_path) == 6
     compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], spec=JobsSpec(journal=journal), seed=4)
     assert fits(tmp_path) == 9
-
-
-def test_a_killed_comparison_goes_on_and_ends_the_same(tmp_path: Path) -> None:
-    program = (
-        "import sys; sys.path[:0] = {here!r}\n"
-        "from pathlib import Path\n"
-        "from support.fakes import study\n"
-        "from test_score import known, SPLITS\n"
-        "from plushsense.experiments.baselines.score import compare\n"
-        "from plushsense.jobs.journal import Journal\n"
-        "from plushsense.jobs.pool import JobsSpec\n"
-        "spec = JobsSpec(journal=Journal({journal!r}))\n"
-        "compare(study(windows=4), [known(Path({folder!r}), pause=0.3)], SPLITS, spec=spec)\n"
-    ).format(here=[str(HERE), str(Path(__file__).parent)], folder=str(tmp_path), journal=str(tmp_path / "journal"))
-    process = subprocess.Popen([sys.executable, "-c", program])
-    until = time.monotonic() + 30
-    while fits(tmp_path) < 3 and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.02)
-    process.kill()
-    assert process.wait() != 0
-    kept = len(list((tmp_path / "journal").glob("*.npz")))
-    assert 2 <= kept < 10
-    before = fits(tmp_path)
-    table = compare(study(windows=4), [known(tmp_path)], SPLITS, spec=JobsSpec(journal=Journal(tmp_path / "journal")))
-    assert table.resumed == kept and fits(tmp_path) == before + 10 - kept
-    whole = compare(study(windows=4), [known(tmp_path)], SPLITS)
-    for one, other in zip(table.models, whole.models, strict=True):
-        assert (one.metrics, one.pooled) == (other.metrics, other.pooled)
 
 
 def test_what_is_refused(tmp_path: Path) -> None:

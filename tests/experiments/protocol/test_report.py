@@ -12,7 +12,6 @@ from plushsense.experiments.protocol import report
 from plushsense.experiments.protocol.report import PAPER
 from plushsense.experiments.protocol.score import (
     SYSTEMS,
-    Aim,
     FamilyConfusion,
     ProtocolResult,
     ScoredTrials,
@@ -57,13 +56,8 @@ def result(simulated=True, label="Tail hit 1", rows=ROWS, **more):
         (StrayEvents("cnn", 0.5, 3, 9, 1, 0, 8.0, 2.0),),
         (outcome, replace(outcome, reaction_s=None)),
     )  # fmt: skip
-    aims = (
-        Aim("Fast", 0.9778, "share", 44, 45, False),
-        Aim("Soon", 1.4, "s", None, 40, True),
-        Aim("Open", None, "share", 0, 0, None),
-    )
     whole = ProtocolResult(
-        scored, "The protocol", simulated, (), aims, ("How it is counted.",), ("No gate.",), (("People", "5"),), "float"
+        scored, "The protocol", simulated, (), ("How it is counted.",), ("No gate.",), (("People", "5"),), "float"
     )
     return replace(whole, **more)
 
@@ -106,12 +100,6 @@ def test_the_csv_holds_numbers_of_groups_and_gestures():
     assert {r["simulated"] for r in rows} == {"yes"}
 
 
-def test_aims_say_met_or_not():
-    assert [(r["measured"], r["met"]) for r in report.aim_table(result()).rows] == [
-        ("97.8 % (44/45)", "NOT met"), ("1.40 s", "met"), ("—", "not measured"),
-    ]  # fmt: skip
-
-
 def test_the_papers_cells_are_of_systems_and_groups_that_there_are():
     from plushsense.experiments.protocol.score import GROUPS, group_of
 
@@ -131,17 +119,15 @@ def test_a_page_is_whole_and_says_what_it_is():
     assert "<b>" not in page
     assert "never shown" not in page
     assert not re.search(r'(src|href)="(?!data:)', page)
-    assert "NOT met" in page
-    real = report.page(result(simulated=False, aims=(), left=(LeftOut("P09", "has no session stream"),)))
+    real = report.page(result(simulated=False, left=(LeftOut("P09", "has no session stream"),)))
     assert "simulation" not in real.lower().replace("<!--", "")
     assert "P09 has no session stream" in real
-    assert "What we aim at" not in real
 
 
 def test_where_the_paper_has_nothing_its_columns_are_not_there():
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
-    other = result(rows=(row("fast", "cnn"), row("other", "cnn")), simulated=False, aims=())
+    other = result(rows=(row("fast", "cnn"), row("other", "cnn")), simulated=False)
     page = report.page(other)
     assert "beside the paper" not in page
     assert "five new people" not in page

@@ -14,7 +14,6 @@ from plushsense.devices.base import Frame
 from plushsense.experiments.protocol.score import (
     FamilyConfusion,
     SystemOutput,
-    aims,
     confusions,
     group_of,
     score,
@@ -150,22 +149,6 @@ def test_a_summary_is_of_all_trials_and_its_times_of_those_that_were_answered():
         FamilyConfusion("cnn", "Tail hit", "Tail hit", 3, 0.75),
         FamilyConfusion("cnn", "Tail hit", None, 1, 0.25),
     ]
-
-
-def test_aims_are_met_missed_or_open():
-    blows = [trial("Tail hit 1", 10.0, 11.0), trial("Tail pull", 20.0, 21.0)]
-    kind = [trial("Back stroke 1", 30.0, 33.0), trial("Ear scratch 1", 40.0, 43.0)]
-
-    def told(*events, system="hybrid"):
-        return outcomes(blows + kind, *events, system=system)[0]
-
-    good = told(*(event("begun", n, t + 0.1, a) for n, t, a in (
-        (1, 10, "negative"), (2, 20, "negative"), (3, 30, "positive"), (4, 40, "positive"))))  # fmt: skip
-    rules = told(event("begun", 1, 41.0), system="rules")
-    assert [a.met for a in aims(good + rules)] == [True, True, True, False]
-    bad = told(event("begun", 1, 11.0, "negative"), event("begun", 2, 31.0, "negative"), event("begun", 3, 42.0))
-    assert [a.met for a in aims(bad)] == [False, False, False, None]
-    assert [a.met for a in aims([])] == [None] * 4
 
 
 @pytest.fixture(scope="module")

@@ -224,8 +224,8 @@ def test_a_folder_of_the_recorder_can_be_scored(dataset: Dataset, recordings: Pa
             "line 3: there is no stream 'P1/fulldatastrem'",
         ),
         (("t,label,stream", "1,Slow,P1/fulldatastrem"), f"Did you mean '{P1}'?"),
-        (("t,label,subject", "1,Slow,P9"), "line 2: subject 'P9' has no stream: accepted are P1, P2, P3, P4"),
-        (("t,label,subject", "1,Slow,P1", "2,Slwo,P1"), "line 3: there is no gesture 'Slwo' in the data set"),
+        (("t,label,subject", "1,Slow,P9"), "line 2: there is no person 'P9'; accepted are P1, P2, P3, P4"),
+        (("t,label,subject", "1,Slow,P1", "2,Slwo,P1"), "line 3: there is no scored gesture 'Slwo'"),
         (("t,label,subject", "2,Slwo,P1"), "Did you mean 'Slow'?"),
         (("t,label,subject", "soon,Slow,P1"), "line 2: t is 'soon': accepted are seconds since the first frame"),
         (("t,label,subject", "-1,Slow,P1"), "line 2: t is '-1'"),
@@ -236,7 +236,10 @@ def test_a_folder_of_the_recorder_can_be_scored(dataset: Dataset, recordings: Pa
         (("t,label,score,subject", "1,Slow,70,P1"), "line 2: score is '70': accepted are 0 to 1"),
         (("t,label,score,subject", "1,Slow,,P1"), "line 2: score is ''"),
         (("t,label,subject", "1,Slow,P1", "1,Fast,P1"), "line 3: t is 1, which is not after line 2 of stream"),
-        (("t,stop,label,affect,subject", "1,2,,positiv,P1"), "affect is 'positiv': accepted are none, positive"),
+        (
+            ("t,stop,label,affect,subject", "1,2,,positiv,P1"),
+            "no affect 'positiv'; accepted are none, positive",
+        ),
         (("t,stop,label,named,subject", "1,2,Slow,3,P1"), "named is '3': accepted are seconds from t to stop"),
     ],
 )
@@ -252,7 +255,7 @@ def test_what_is_wrong_is_said_with_its_line(
 
 def test_other_refusals(dataset: Dataset, tmp_path: Path) -> None:
     file = written(tmp_path / "p.csv", "t,label,subject", "1,Slow,P1")
-    with pytest.raises(FileFormatError, match="not one of the classes that are scored, Rest, Fast: choose others"):
+    with pytest.raises(FileFormatError, match="no scored gesture 'Slow'; accepted are Rest, Fast, or nothing"):
         score_predictions(dataset.path, file, classes="Rest,Fast")
     with pytest.raises(FileFormatError, match="no column 'score': add one, or give no threshold"):
         score_predictions(dataset.path, file, threshold=0.5)

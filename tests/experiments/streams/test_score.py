@@ -364,7 +364,7 @@ def test_folds_keep_people_apart_and_are_resumed(dataset: Dataset, tmp_path: Pat
     assert len(fit.notes.read_text().splitlines()) == 6
 
     table = summed(folds)
-    plain = table["systems"]["argmax"]["plain"]
+    plain = table.systems["argmax"]["plain"]
     assert plain["truths"] == 12 and plain["hits"] + plain["deletions"] == 12
     assert [p["subject"] for p in plain["people"]] == sorted(tested)
     assert sum(p["truths"] for p in plain["people"]) == 12
@@ -372,13 +372,13 @@ def test_folds_keep_people_apart_and_are_resumed(dataset: Dataset, tmp_path: Pat
     alone = pooled_scores(scores.values()).to_dict()
     for name in ("events", "hits", "insertions", "fragmentations", "merges", "latency_s", "cost_per_truth"):
         assert alone[name] == plain[name], name
-    assert table["reference"] is None and table["at_recall"] == []
+    assert table.reference is None and table.at_recall == []
 
 
 def test_a_reference_beside_itself_is_one(dataset: Dataset, tmp_path: Path) -> None:
     settings = Settings(("argmax", "smoothed"), targets=(0.2, 0.5, 0.8))
     folds = crossvalidated_streams(dataset, "by-subject:2", Remembering(tmp_path / "notes"), settings=settings)
-    rows = summed(folds)["at_recall"]
+    rows = summed(folds).at_recall
     ratios = [row["systems"]["smoothed"]["ratio"] for row in rows]
     assert {r for r in ratios if r is not None} <= {1.0} and any(r is not None for r in ratios)
 

@@ -181,14 +181,6 @@ def test_what_cannot_be_read_is_said_all_at_once_and_the_rest_is_read(tmp_path: 
     assert grid == GridSpec(name="g", split="windows:5")
 
 
-def test_a_list_with_one_unreadable_item_keeps_the_others_for_the_other_problems(tmp_path: Path) -> None:
-    path = tmp_path / "g.toml"
-    path.write_text('[grid]\nepochs = [3, "x"]\nbatches = [64, "half", 90000]\nfilters = [[4, 6], "a"]\n')
-    grid, found = load_grid(path)
-    assert len(found) == 3
-    assert (grid.epochs, grid.batches, grid.filters) == ((3,), (64, 90000), ((4, 6),))
-
-
 def test_unknown_grids_and_files(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="Did you mean 'paper'"):
         load_grid("papr")

@@ -8,23 +8,31 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from plushsense.core.errors import ConfigError, DivergedError, TrainingError
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.scores import read_predictions
 from plushsense.experiments.sweep.grid import CHOSEN, SECOND
-from plushsense.experiments.sweep.run import sweep
-from plushsense.experiments.sweep.trials import TRIAL_COLUMNS, TrialColumn, TrialResult, networks_to_keep
+from plushsense.experiments.sweep.trainings import RunScores
+from plushsense.experiments.sweep.trials import (
+    TRIAL_COLUMNS,
+    TrialColumn,
+    TrialResult,
+    best_on_validation,
+    networks_to_keep,
+    ranked,
+)
 from plushsense.jobs.journal import JOURNAL, UNFINISHED
 from plushsense.jobs.progress import JobProgress
 from plushsense.scoring.metrics import confusion
+from support.sweeping import keys, sweep
 
 pytestmark = pytest.mark.apart("cluster")
 
@@ -55,10 +63,10 @@ def test_nested_epochs_score_as_trainings_of_their_own(
     from polars.testing import assert_frame_equal
 
     together = sweep(dataset, epochs=(1, 2, 5), split="by-subject:2", out=tmp_path / "all", **SMALL, **changes)
-    assert (together.to_json()["trials"], together.to_json()["trainings"]) == (12, 8)
+    assert (together.head["trials"], together.head["trainings"]) == (12, 8)
     for epochs in (1, 2, 5):
         alone = sweep(dataset, epochs=(epochs,), split="by-subject:2", out=tmp_path / str(epochs), **SMALL, **changes)
-        assert alone.to_json()["trainings_resumed"] == 0
+        assert alone.head["trainings_resumed"] == 0
         mine = together.trials.filter(polars.col("epochs") == epochs)
         assert_frame_equal(mine.drop("seconds"), alone.trials.drop("seconds"), check_exact=True)
     assert together.trials["train_loss"].n_unique() == 12, "they are different trainings"
@@ -66,7 +74,7 @@ def test_nested_epochs_score_as_trainings_of_their_own(
 
 def test_where_validation_stops_each_is_trained_apart(dataset: Dataset, tmp_path: Path) -> None:
     found = sweep(dataset, epochs=(2, 12), patience=1, out=tmp_path / "o", **SMALL)
-    assert found.to_json()["trainings"] == found.to_json()["trials"] == 8
+    assert found.head["trainings"] == found.head["trials"] == 8
     curves = frame(tmp_path / "o", "curves")
     lengths = dict(curves.group_by("run").len().iter_rows())
     assert min(lengths.values()) <= 2 and max(lengths.values()) > 2
@@ -112,8 +120,19 @@ def test_the_folder_holds_what_it_promises(dataset: Dataset, tmp_path: Path) -> 
 
 
 def test_predictions_are_kept_of_the_networks_that_were_asked_for(cli: Any, dataset: Dataset, tmp_path: Path) -> None:
-    words = ("--architectures", "9,5_5d2", "--filters", "2/2,3/3", "--epochs", "1,2", "--batches", "4")
-    words = ("sweep", dataset.path, *words, "--classes", "shared", "--workers", "1", "--out", tmp_path / "o", "--json")
+    words = (*keys(architectures="9,5_5d2", filters="2/2,3/3"), "--epochs", "1,2", *keys(batches="4"))
+    words = (
+        "sweep",
+        dataset.path,
+        *words,
+        "--set",
+        "classes=shared",
+        "--workers",
+        "1",
+        "--out",
+        tmp_path / "o",
+        "--json",
+    )
 
     def files() -> set[str]:
         return {path.name for path in (tmp_path / "o").glob("predictions*")}
@@ -157,23 +176,23 @@ def test_it_goes_on_and_is_made_again_from_the_journal(dataset: Dataset, tmp_pat
     assert first.out.parent == dataset.path / "evaluations" and first.out.name.startswith(
         "sweep-paper-windows-holdout-"
     )
-    assert first.to_json()["leaky"] and "leaky" in repr(first)
+    assert first.head["leaky"] and "leaky" in repr(first)
     shutil.rmtree(first.out)
     again = sweep(dataset.path, epochs=(1, 2), **SMALL)
-    assert again.to_json()["resumed"] == again.to_json()["trials"] == 8
+    assert again.head["resumed"] == again.head["trials"] == 8
     assert_frame_equal(again.trials, first.trials, check_exact=True)
     journal = sorted((dataset.path / "cache" / "sweeps").iterdir())
     assert len(journal) == 4
     journal[0].unlink()
     journal[1].write_bytes(journal[1].read_bytes()[:100])
     healed = sweep(dataset, epochs=(1, 2), **SMALL)
-    assert healed.to_json()["trainings_resumed"] == 2 and healed.to_json()["resumed"] == 4
+    assert healed.head["trainings_resumed"] == 2 and healed.head["resumed"] == 4
     assert_frame_equal(healed.trials.drop("seconds"), first.trials.drop("seconds"), check_exact=True)
     # Threads sum in another order: they are other trainings.
-    assert sweep(dataset, epochs=(1, 2), threads=2, **SMALL).to_json()["resumed"] == 0
+    assert sweep(dataset, epochs=(1, 2), threads=2, **SMALL).head["resumed"] == 0
     with pytest.raises(ConfigError, match=r"holds a sweep of other settings or other data.*--force"):
         sweep(dataset, epochs=(1,), out=first.out, **SMALL)
-    assert sweep(dataset, epochs=(1,), out=first.out, overwrite=True, **SMALL).to_json()["trials"] == 4
+    assert sweep(dataset, epochs=(1,), out=first.out, overwrite=True, **SMALL).head["trials"] == 4
 
 
 def test_a_network_gets_the_past_that_it_needs(dataset: Dataset, tmp_path: Path) -> None:
@@ -181,7 +200,7 @@ def test_a_network_gets_the_past_that_it_needs(dataset: Dataset, tmp_path: Path)
     settings = {"padding": "stream", "context": "stream", "split": "by-subject:2"}
     found = sweep(dataset, epochs=(1,), out=tmp_path, **settings, **changes)
     assert dict(found.trials.select("arch", "span").iter_rows()) == {"9": 248, "70d4": 526}
-    assert found.to_json()["done"] == 2
+    assert found.head["done"] == 2
 
 
 def test_one_that_diverges_is_told_and_the_others_go_on(
@@ -200,7 +219,7 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
 
     monkeypatch.setattr(room, "fit", fit)
     found = sweep(dataset, epochs=(1, 2, 3), out=tmp_path, **SMALL)
-    said = {(f["arch"], f["epochs"], f["why"]) for f in found.to_json()["failed"]}
+    said = {(f["arch"], f["epochs"], f["why"]) for f in found.head["failed"]}
     assert said == {("9", 3, "the loss is no number")}, "once for each batch"
     status = {(row["arch"], row["epochs"]): row["status"] for row in found.trials.iter_rows(named=True)}
     assert status == {("5d1_5d2", e): "done" for e in (1, 2, 3)} | {
@@ -209,10 +228,10 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
         ("9", 3): "failed",
     }
     assert found.trials.filter(polars.col("status") == "failed")["accuracy"].null_count() == 2
-    assert found.to_json()["done"] == 10
+    assert found.head["done"] == 10
     # Nothing of it went well: there is no curve either.
     alone = sweep(dataset, epochs=(3,), out=tmp_path, overwrite=True, **SMALL)
-    assert (alone.to_json()["done"], len(alone.to_json()["failed"]), len(frame(tmp_path, "curves"))) == (2, 2, 2 * 3)
+    assert (alone.head["done"], len(alone.head["failed"]), len(frame(tmp_path, "curves"))) == (2, 2, 2 * 3)
 
 
 def test_a_long_training_goes_on_where_it_was_stopped(
@@ -255,7 +274,7 @@ def test_a_state_that_cannot_be_kept_stops_no_training(
     monkeypatch.setattr(room, "fit", partial(room.fit, save_every_s=0.0))
     (dataset.path / "cache").mkdir(parents=True)
     (dataset.path / "cache" / UNFINISHED).write_text("a file where the folder would be")
-    assert sweep(dataset, epochs=(1, 2), out=tmp_path, **SMALL).to_json()["done"] == 8
+    assert sweep(dataset, epochs=(1, 2), out=tmp_path, **SMALL).head["done"] == 8
 
 
 def test_a_grid_in_another_order_is_the_same_sweep(dataset: Dataset, tmp_path: Path) -> None:
@@ -264,24 +283,20 @@ def test_a_grid_in_another_order_is_the_same_sweep(dataset: Dataset, tmp_path: P
     first = sweep(dataset, epochs=(1,), seeds=(0, 1), out=tmp_path, **SMALL)
     turned = SMALL | {"architectures": ("9", "5_5d2"), "batches": ("full", 4)}
     again = sweep(dataset, epochs=(1,), seeds=(1, 0), out=tmp_path, **turned)
-    assert again.to_json()["id"] == first.to_json()["id"] and again.to_json()["resumed"] == 4
+    assert again.head["id"] == first.head["id"] and again.head["resumed"] == 4
     assert_frame_equal(again.trials.sort("trial"), first.trials.sort("trial"))
 
 
-def test_of_equals_on_validation_the_test_part_does_not_choose(dataset: Dataset, tmp_path: Path) -> None:
-    found = sweep(dataset, epochs=(1,), out=tmp_path, **SMALL)
-    scores = {"validation_macro_f1": 0.5}
+def test_of_equals_on_validation_the_test_part_does_not_choose() -> None:
+    def made(parameters: int) -> TrialResult:
+        trial: Any = SimpleNamespace(arch=SimpleNamespace(parameters=parameters))
+        head: Any = None
+        figures = {"validation_macro_f1": 0.5, "accuracy": parameters / 1e6}
+        return TrialResult(trial, (RunScores(figures, np.zeros((2, 2), np.int64), 1, 0.0),), "done", head)
 
-    def alike(result: TrialResult) -> TrialResult:
-        (run,) = result.scored
-        accuracy = result.trial.arch.parameters / 1e6
-        return replace(result, scored=(replace(run, figures={**run.figures, **scores, "accuracy": accuracy}),))
-
-    found = replace(found, results=tuple(map(alike, found.results)))
-    sizes = [result.trial.arch.parameters for result in found.ranked]
-    assert sizes[0] > min(sizes)
-    chosen = found.best_on_validation
-    assert chosen is not None and chosen.trial.arch.parameters == min(sizes)
+    results = [made(size) for size in (300, 100, 200)]
+    assert [result.trial.arch.parameters for result in ranked(results)] == [300, 200, 100]
+    assert best_on_validation(results) is results[1] and best_on_validation([]) is None
 
 
 def test_what_keeps_the_first_trainings_from_being_done_ends_the_sweep(
@@ -311,22 +326,22 @@ def test_one_lost_training_is_told_and_its_trials_wait(
 
     monkeypatch.setattr(room, "fit", fit)
     found = sweep(dataset, epochs=(1,), out=tmp_path, **SMALL)
-    assert found.to_json()["trainings_lost"] == 2 == len(found.to_json()["failed"])
+    assert found.head["trainings_lost"] == 2 == len(found.head["failed"])
     assert set(found.trials["status"]) == {"done", "waiting"}
     monkeypatch.setattr(room, "fit", real)
-    assert sweep(dataset, epochs=(1,), out=tmp_path, **SMALL).to_json()["failed"] == []
+    assert sweep(dataset, epochs=(1,), out=tmp_path, **SMALL).head["failed"] == []
 
 
 def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path: Path) -> None:
     grid = tmp_path / "tiny.toml"
     grid.write_text('[grid]\narchitectures = ["9", "5_5d2"]\nfilters = [[2, 2]]\nepochs = [1]\nbatches = [4]\n')
-    dry = cli("sweep", dataset.path, "--grid", grid, "--classes", "shared", "--dry-run", "--json")
+    dry = cli("sweep", dataset.path, "--grid", grid, *keys(classes="shared"), "--dry-run", "--json")
     assert dry.status == 0 and (dry.json["trials"], dry.json["held"], dry.json["problems"]) == (2, 0, [])
     assert sum(dry.json["cost"].values()) == pytest.approx(1.0) and dry.json["macs"] > 0
     assert 0.01 < dry.json["training_mb"] < 5.0
-    plain = cli("sweep", dataset.path, "--grid", grid, "--padding", "causal", "--dry-run")
+    plain = cli("sweep", dataset.path, "--grid", grid, *keys(padding="causal"), "--dry-run")
     assert "as PyTorch takes it" in plain.out
-    told = cli("sweep", dataset.path, "--grid", grid, "--classes", "shared", "--dry-run").out
+    told = cli("sweep", dataset.path, "--grid", grid, *keys(classes="shared"), "--dry-run").out
     assert "LEAKY" in told and ("SIMULATION" in told) == dry.json["simulated"]
     assert "2 trials in 2 trainings (1 fold, 1 seed)" in told
     assert not (dataset.path / "evaluations").exists() and not (dataset.path / "cache" / "sweeps").exists()
@@ -339,7 +354,7 @@ def test_a_grid_file_from_the_command_line(cli: Any, dataset: Dataset, tmp_path:
     text = cli("sweep", dataset.path, "--grid", grid).out
     assert text.startswith("LEAKY") and "accuracy (leaky)" in text and "2 of 2 trials done (2 from before)" in text
     people = cli(
-        "sweep", dataset.path, "--grid", grid, "--split", "by-subject:2", "--classes", "shared", "--seeds", "2"
+        "sweep", dataset.path, "--grid", grid, "--split", "by-subject:2", *keys(classes="shared"), "--seeds", "2"
     )
     assert people.status == 0 and "leaky" not in people.out.lower()
     assert "8 of 8 trainings" in people.err
@@ -350,7 +365,18 @@ def test_a_new_column_is_a_function_and_a_line(
 ) -> None:
     depth = TrialColumn(int, lambda trial: len(trial.trial.arch.filters), "convolutions", "count")
     monkeypatch.setitem(TRIAL_COLUMNS, "depth", depth)
-    words = ("--architectures", "9,5_5d2", "--filters", "2,2", "--epochs", "1", "--batches", "4", "--classes", "shared")
+    words = (
+        "--set",
+        "architectures=9,5_5d2",
+        "--set",
+        "filters=2,2",
+        "--epochs",
+        "1",
+        "--set",
+        "batches=4",
+        "--set",
+        "classes=shared",
+    )
     ran = cli("sweep", dataset.path, *words, "--out", tmp_path / "out")
     assert "convolutions" in ran.out
     saved = json.loads((tmp_path / "out" / "sweep.json").read_text())
@@ -378,16 +404,38 @@ def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset,
         assert words in ran.err, words
     assert not (dataset.path / "cache").exists() and not (dataset.path / "evaluations").exists()
     small = cli(
-        "sweep", dataset.path, "--batches", "4000", "--epochs", "2", "--architectures", "9x", "--dry-run", "--json"
+        "sweep",
+        dataset.path,
+        "--set",
+        "batches=4000",
+        "--epochs",
+        "2",
+        "--set",
+        "architectures=9x",
+        "--dry-run",
+        "--json",
     )
     assert small.status == 1 and len(small.json["problems"]) == 2
     assert any("A batch of 4000 is larger than the" in line for line in small.json["problems"])
-    small = cli("sweep", dataset.path, "--batches", "4000", "--epochs", "2", "--split", "by-me", "--dry-run", "--json")
+    small = cli(
+        "sweep", dataset.path, *keys(batches="4000"), "--epochs", "2", "--split", "by-me", "--dry-run", "--json"
+    )
     assert ["A batch of 4000" in line or "Unknown split" in line for line in small.json["problems"]] == [True, True]
     assert "Unknown grid 'papr'" in cli("sweep", dataset.path, "--grid", "papr").err
     assert "no seeds" in cli("sweep", dataset.path, "--seeds", "0").err
     (tmp_path / "file").write_text("")
-    taken = cli("sweep", dataset.path, "--architectures", "9", "--classes", "shared", "--batches", "4", "--out", grid)
+    taken = cli(
+        "sweep",
+        dataset.path,
+        "--set",
+        "architectures=9",
+        "--set",
+        "classes=shared",
+        "--set",
+        "batches=4",
+        "--out",
+        grid,
+    )
     assert taken.status == 2 and "is a file" in taken.err
 
 
@@ -407,7 +455,7 @@ def test_killed_and_gone_on_with(cli: Any, four_people: Path, tmp_path: Path, ha
     }
     if halving:
         options |= {"split": "by-subject:2", "batches": "32", "epochs": "1,2,4", "share": "0.8"}
-    words = [word for key, value in options.items() for word in (f"--{key}", value)]
+    words = keys(**options)
     words += ["--halving"] * halving + ["--out", str(tmp_path / "out"), "--json"]
     journal = tmp_path / "DS" / "cache" / "sweeps"
 
@@ -444,7 +492,7 @@ def test_killed_and_gone_on_with(cli: Any, four_people: Path, tmp_path: Path, ha
     assert found["trainings_resumed"] == len(before) < len(after) == found["trainings_done"]
     assert all(after[name] == content for name, content in before.items())
     whole = sweep(tmp_path / "whole", out=tmp_path / "other", workers=1, halving=halving, **options)
-    stored = whole.to_json()
+    stored = whole.head
     assert (found["trials"], found["done"]) == (stored["trials"], stored["done"])
     if halving:
         assert found["halving"]["rungs"] == stored["halving"]["rungs"]

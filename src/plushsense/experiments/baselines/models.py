@@ -7,7 +7,7 @@ Names such as "cubic SVM" and "subspace kNN" are presets of MATLAB's Classificat
 
 from __future__ import annotations
 
-import difflib
+import math
 import pickle
 import warnings
 from collections.abc import Callable, Sequence
@@ -250,39 +250,19 @@ def parse_recurrent(text: str) -> RecurrentSpec:
     """Return the network of a text such as ``lstm``, or ``bilstm:units=512:layers=2:dropout=0.5``.
 
     Raises:
-        ConfigError: for a setting that is unknown, given twice or out of range; the message has the nearest valid text.
+        ConfigError: for a setting that is unknown, given twice or out of range.
     """
     kind, *settings = text.split(":")
-    pairs = [setting.rpartition("=")[::2] for setting in settings]
-    found = _with_settings(kind, pairs)
-    if found is not None:
-        return found
-    # To suggest a valid text, values without a name are taken in the order of the settings.
-    named = [
-        (next(iter(difflib.get_close_matches(name, _LIMITS, 1)), key), value)
-        for key, (name, value) in zip(_LIMITS, pairs, strict=False)
-    ]
-    guess = _with_settings(kind, named) if len(named) == len(pairs) else None
-    limits = ", ".join(f":{key}=NUMBER ({low:g} to {high:g})" for key, (low, high) in _LIMITS.items())
-    raise ConfigError(
-        f"Model '{text}': after {kind}, accepted are {limits}, each at most once."
-        + (f" Did you mean '{guess.name}'?" if guess else "")
-    )
-
-
-def _with_settings(kind: str, settings: Sequence[tuple[str, ...]]) -> RecurrentSpec | None:
-    """Return the network with some settings (name, value), or None if one is invalid."""
     found: dict[str, Any] = {}
-    for name, value in settings:
-        if name not in _LIMITS or name in found:
-            return None
+    for name, _, value in (setting.partition("=") for setting in settings):
+        low, high = _LIMITS.get(name, (1, 0))
         try:
             number = float(value) if name == "dropout" else int(value)
         except ValueError:
-            return None
-        low, high = _LIMITS[name]
-        if not low <= number <= high:
-            return None
+            number = math.nan
+        if name in found or not low <= number <= high:
+            limits = ", ".join(f":{key}=NUMBER ({low:g} to {high:g})" for key, (low, high) in _LIMITS.items())
+            raise ConfigError(f"Model '{text}': after {kind}, accepted are {limits}, each at most once.")
         found[name] = number
     return RecurrentSpec(kind, **found)
 

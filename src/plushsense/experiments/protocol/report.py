@@ -133,19 +133,6 @@ def _judgements(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{n} {_JUDGED[judged]}" for judged, n in counts.items() if n) or DASH
 
 
-def judged_table(result: ProtocolResult) -> Table:
-    """Return one row for each group and system with a network: how its first gesture compares with the true one."""
-    rows = tuple(
-        {"title": row.title, "system": _SHORT[row.system]}
-        | {judged: percent(row.figures.called[judged], row.figures.trials) for judged in _JUDGED}
-        for row in result.scored.rows
-        if row.system not in NAMELESS
-    )
-    columns: tuple[Column, ...] = (Column("title", "Gestures"), Column("system", "System"))
-    columns += tuple(Column(judged, head, "right") for judged, head in _JUDGED.items())
-    return Table("judged", "What was said first", columns, rows)
-
-
 def confusion_table(result: ProtocolResult) -> Table:
     """Return one row for each true family and system with a network: the recognised families, most frequent first."""
     called: dict[tuple[str, str], list[str]] = {}
@@ -190,24 +177,6 @@ def between_table(result: ProtocolResult) -> Table:
         Column("negatives", "Negative,\nan hour", "right"),
     )
     return Table("between", "Between the gestures", columns, rows)
-
-
-def aim_table(result: ProtocolResult) -> Table:
-    """Return one row for each aim of the project: the measured value, and whether the aim is met."""
-    rows = []
-    for aim in result.aims:
-        measured = seconds(aim.measured) + " s" if aim.part is None else percent(aim.part, aim.of)
-        met = {None: "not measured", True: "met", False: "NOT met"}[aim.met]
-        rows.append(
-            {
-                "aim": aim.aim,
-                "measured": DASH if aim.met is None else measured,
-                "met": met,
-                "class": "unmet" if aim.met is False else "",
-            }
-        )
-    columns = (Column("aim", "Aim"), Column("measured", "Measured", "right"), Column("met", "\N{NO-BREAK SPACE}"))
-    return Table("aims", "What we aim at", columns, tuple(rows))
 
 
 def figure_table(result: ProtocolResult) -> Table:
@@ -302,10 +271,8 @@ def page(result: ProtocolResult) -> str:
         simulated=result.simulated,
         about=result.about,
         remarks=result.said,
-        aims=aim_table(result),
         groups=group_table(result),
         gestures=gesture_table(result),
-        judged=judged_table(result),
         confusions=confusion_table(result),
         between=between_table(result),
         left=result.left,

@@ -6,17 +6,15 @@ import json
 import os
 import tempfile
 from collections.abc import Collection, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.files import temporary_folder, write_file
+from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.quantize import integer_model
 from plushsense.experiments.protocol.score import (
@@ -24,7 +22,6 @@ from plushsense.experiments.protocol.score import (
     ProtocolResult,
     RuleBaseline,
     ScoredTrials,
-    aims,
     score_sittings,
 )
 from plushsense.experiments.protocol.sittings import (
@@ -37,6 +34,7 @@ from plushsense.experiments.protocol.sittings import (
     virtual_numbers,
     virtual_sittings,
 )
+from plushsense.experiments.recordings import opened
 from plushsense.jobs.study import Progress
 from plushsense.models.arch import slashed
 from plushsense.models.bundle import Bundle, known_people
@@ -115,27 +113,15 @@ def protocol(
     if subjects is not None and dataset is None and session is None:
         raise ConfigError("Subjects are people of a data set or session; of virtual people give their number.")
     place = None if out is None else _place(Path(out))
-    if dataset is not None:
-        dataset = as_dataset(dataset)
-        scene = _recorded(dataset, bundle, subjects, rules)
-    elif session is not None:
-        with temporary_folder() as work:
-            folder = work / "session"
-            import_recordings(
-                Path(session),
-                folder,
-                layout=bundle.layout,
-                gestures=bundle.gestures,
-                name=Path(session).resolve().name,
-                adopt_proposals=False,
-            )
-            scene = _recorded(as_dataset(folder), bundle, subjects, rules)
-    else:
-        scene = _virtual(virtual or VirtualPeople(), bundle, rules)
-    result = _scored(scene, bundle, engine, progress)
-    if place is not None:
-        with nullcontext() if dataset is None else as_dataset(dataset).generation.writing():
-            result = _write(result, place)
+    source = dataset if dataset is not None else session
+    if source is None:
+        result = _scored(_virtual(virtual or VirtualPeople(), bundle, rules), bundle, engine, progress)
+        return result if place is None else _write(result, place)
+    with opened(source, bundle.layout, bundle.gestures) as recorded:
+        result = _scored(_recorded(recorded, bundle, subjects, rules), bundle, engine, progress)
+        if place is not None:
+            with recorded.generation.writing():
+                result = _write(result, place)
     return result
 
 
@@ -201,7 +187,6 @@ class _Scene:
     counted: tuple[str, ...]
     codes: tuple[str, ...] = ()
     left: tuple[LeftOut, ...] = ()
-    with_aims: bool = False
 
 
 def _virtual(virtual: VirtualPeople, bundle: Bundle, rules: bool) -> _Scene:
@@ -219,7 +204,6 @@ def _virtual(virtual: VirtualPeople, bundle: Bundle, rules: bool) -> _Scene:
         True,
         whom,
         ("answered", "onset_virtual", "likelihood"),
-        with_aims=True,
     )
 
 
@@ -257,7 +241,6 @@ def _scored(scene: _Scene, bundle: Bundle, engine: str, progress: Progress | Non
         scene.heading,
         scene.simulated,
         scene.left,
-        tuple(aims(scored.outcomes)) if scene.with_aims else (),
         tuple(NOTES[key] for key in scene.counted),
         tuple(_notes(scene, scored, bundle)),
         tuple(_about(scene, scored, bundle, engine)),

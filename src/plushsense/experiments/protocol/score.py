@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean
 from typing import Any
 
 import numpy as np
@@ -515,63 +515,12 @@ def score_sittings(
 
 
 @dataclass(frozen=True)
-class Aim:
-    """An aim of this project with what was measured: a share or seconds (``unit``).
-
-    ``part`` and ``of`` are the counts of a share; ``met`` is None where there is no trial to measure it on.
-    """
-
-    aim: str
-    measured: float | None
-    unit: str
-    part: int | None
-    of: int
-    met: bool | None
-
-    @classmethod
-    def share(cls, words: str, part: int, of: int, line: float, *, most: bool = False) -> Aim:
-        """Return an aim for a share: at least, or at most, ``line``."""
-        share = part / of if of else None
-        met = None if share is None else share <= line if most else share >= line
-        return cls(words, _share(part, of), "share", part, of, met)
-
-
-def aims(outcomes: Sequence[TrialOutcome]) -> list[Aim]:
-    """Return this project's aims for the protocol with the measured values."""
-    hybrid = [o for o in outcomes if o.system == "hybrid"]
-    blows = [o for o in hybrid if o.group == "energetic"]
-    kind = [o for o in hybrid if o.affect in ("positive", "neutral")]
-    answered = [o.reaction_s for o in kind if o.reaction_s is not None]
-    fine = [o for o in outcomes if o.system == "rules" and o.group == "fine"]
-    quick = sum(o.reaction_s is not None and o.reaction_s <= QUICK_S for o in blows)
-    time_s = round(median(answered), 3) if answered else None
-    met = None if time_s is None else time_s < 1.5
-    negative = sum(o.negative for o in kind)
-    scratches = sum(o.reaction_s is not None for o in fine)
-    return [
-        Aim.share(
-            "Hybrid: blows and pulls answered within 0.2 s in at least 98 % of the trials", quick, len(blows), 0.98
-        ),
-        Aim.share(
-            "Hybrid: gentle gestures called negative in at most 1 % of the trials", negative, len(kind), 0.01, most=True
-        ),
-        Aim("Hybrid: median reaction to gentle gestures under 1.5 s", time_s, "s", None, len(answered), met),
-        Aim.share(
-            "Rules only: fine scratches answered in at most 20 % of the trials (the paper: about 6 %)",
-            *(scratches, len(fine), 0.2),
-            most=True,
-        ),
-    ]
-
-
-@dataclass(frozen=True)
 class ProtocolResult:
     """The result of the protocol, as its page shows it.
 
     Attributes:
         simulated: whether the people or their toy were virtual.
         left: people who were left out.
-        aims: only for virtual people.
         counted: notes on how figures are counted.
         said: notes on the limits of the figures.
         about: rows (name, value) on people, network and settings.
@@ -582,7 +531,6 @@ class ProtocolResult:
     heading: str
     simulated: bool
     left: tuple[LeftOut, ...]
-    aims: tuple[Aim, ...]
     counted: tuple[str, ...]
     said: tuple[str, ...]
     about: tuple[tuple[str, str], ...]
@@ -596,7 +544,6 @@ class ProtocolResult:
             "heading": self.heading,
             "simulated": self.simulated,
             "left": [dict(vars(one)) for one in self.left],
-            "aims": [dict(vars(aim)) for aim in self.aims],
             "counted": list(self.counted),
             "said": list(self.said),
             "about": [list(row) for row in self.about],

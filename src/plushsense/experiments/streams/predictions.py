@@ -24,6 +24,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -47,6 +48,9 @@ EVENT_COLUMNS = {
 }
 DECISION_COLUMNS = tuple(name for name in EVENT_COLUMNS if name not in ("stop", "affect", "named"))
 _THRESHOLDS = 21
+Entry = TypeVar("Entry")
+# What a row names its stream by, and what to do about one that cannot be found.
+_NAMED_BY = {"subject": ("person", ", who have one stream; name streams in a column 'stream'")}
 # Times may exceed the end of the stream by this, as systems round them.
 _ROUNDING_S = 0.1
 
@@ -121,7 +125,7 @@ def read_predictions(
 
     Args:
         gestures: the classes that are scored.
-        known: the gestures of the data set.
+        known: the gestures of the data set, of which idle ones may be named, too.
         streams: the streams that may be named.
         alone: the stream of all rows, if the file has no column for it.
 
@@ -133,7 +137,49 @@ def read_predictions(
         columns, rows = read_csv_rows(place, "predictions")
     except FileNotFoundError:
         raise FileFormatError(f"There is no file '{place}': give a CSV file of predictions.") from None
-    accepted = EVENT_COLUMNS if "stop" in columns else DECISION_COLUMNS
+    _check_columns(place, columns)
+    if not rows:
+        raise FileFormatError(
+            f"'{place}' has no rows below its header: give a row for each decision or event, and for a stream without "
+            "events one with an empty label."
+        )
+    column = next((c for c in ("stream", "subject") if c in columns), None)
+    named = _streams_by(column, streams, alone, place)
+    idle = {g.label: NO_GESTURE for g in (*known.gestures, *gestures.gestures) if g.idle}
+    classes = {"": NO_GESTURE, **{label: k for k, label in enumerate(gestures.labels)}, **idle}
+    are_events, scored = "stop" in columns, "score" in columns
+    by_stream: dict[str, list[Prediction]] = {}
+    for line, cells in rows:
+        where = f"'{place}' line {line}"
+        stream = _entry(named, cells.get(column or "", ""), where, *_NAMED_BY.get(column or "", ("stream",)))
+        mine = by_stream.setdefault(stream, [])
+        start_s = _number(cells, "t", where, "seconds since the first frame of the stream", 0.0)
+        stop_s = _number(cells, "stop", where, "seconds, at least t", start_s) if are_events else start_s
+        named_s = start_s
+        if cells.get("named"):
+            named_s = _number(cells, "named", where, "seconds from t to stop", start_s, stop_s)
+        label = cells["label"]
+        if label not in classes and (found := gestures.find(label) or known.find(label)) is not None:
+            label = found.label
+        gesture = _entry(classes, label, where, "scored gesture", ", or nothing; choose others with --classes")
+        affect = 0 if gesture == NO_GESTURE else AFFECT_CODES[gestures.affects[gesture]]
+        if cells.get("affect"):
+            affect = _entry(AFFECT_CODES, cells["affect"], where, "affect")
+        elif are_events and gesture == NO_GESTURE:
+            continue
+        score = 1.0
+        if scored and (gesture != NO_GESTURE or cells["score"]):
+            score = _number(cells, "score", where, "0 to 1", 0.0, 1.0)
+        if not are_events and mine and start_s <= mine[-1].event.start_s:
+            raise FileFormatError(
+                f"{where}: t is {cells['t']}, which is not after line {mine[-1].line} of stream '{stream}': sort the "
+                "rows of each stream by t, with one row a decision."
+            )
+        mine.append(Prediction(line, ReportedEvent(start_s, stop_s, gesture, named_s, affect, CNN), score))
+    return StreamPredictions(str(place), by_stream, are_events, scored)
+
+
+def _check_columns(place: Path, columns: Sequence[str]) -> None:
     for name in ("t", "label"):
         if name not in columns:
             there = f"it has {', '.join(columns)}" if any(columns) else "it is empty"
@@ -142,130 +188,35 @@ def read_predictions(
                 f"{', '.join(c for c in EVENT_COLUMNS if c not in ('t', 'label'))}."
             )
     for name in columns:
-        if name not in accepted:
+        if name not in (EVENT_COLUMNS if "stop" in columns else DECISION_COLUMNS):
             raise FileFormatError(
                 f"'{place}' has an unknown column '{name}': accepted are {', '.join(DECISION_COLUMNS)}, and for events "
                 f"stop, affect and named.{nearest(name, EVENT_COLUMNS)}"
             )
-    if not rows:
+
+
+def _streams_by(column: str | None, streams: Sequence[StreamInfo], alone: str | None, place: Path) -> dict[str, str]:
+    """Return the id of each stream that a row may name by its text in ``column``: an id, or a person."""
+    if column == "stream":
+        return {s.id: s.id for s in streams}
+    if column == "subject":
+        people = [s.subject for s in streams]
+        return {s.subject: s.id for s in streams if people.count(s.subject) == 1}
+    if alone is None:
         raise FileFormatError(
-            f"'{place}' has no rows below its header: give a row for each decision or event, and for a stream without "
-            "events one with an empty label."
+            f"'{place}' has no column 'stream', but several streams are scored: add one with their ids "
+            f"({shortened([s.id for s in streams])}), or name a single person with --subjects."
         )
-    reader = _RowReader(str(place), columns, gestures, known, streams, alone)
-    by_stream: dict[str, list[Prediction]] = {}
-    for line, cells in rows:
-        stream, row = reader.read(line, cells)
-        mine = by_stream.setdefault(stream, [])
-        if row is None:
-            continue
-        if not reader.are_events and mine and row.event.start_s <= mine[-1].event.start_s:
-            raise FileFormatError(
-                f"'{place}' line {line}: t is {cells['t']}, which is not after line {mine[-1].line} of stream "
-                f"'{stream}': sort the rows of each stream by t, with one row a decision."
-            )
-        mine.append(row)
-    return StreamPredictions(str(place), by_stream, reader.are_events, reader.scored)
+    return {"": alone}
 
 
-class _RowReader:
-    """Converts the cells of a row; messages name the file and the line."""
-
-    def __init__(
-        self,
-        file: str,
-        columns: Sequence[str],
-        gestures: GestureSet,
-        known: GestureSet,
-        streams: Sequence[StreamInfo],
-        alone: str | None,
-    ) -> None:
-        self._file, self._gestures, self._known, self._streams, self._alone = file, gestures, known, streams, alone
-        self.are_events, self.scored = "stop" in columns, "score" in columns
-        self._stream_column = next((c for c in ("stream", "subject") if c in columns), None)
-        self._classes: dict[str, int] = {}
-        self._ids: dict[str, str] = {}
-
-    def read(self, line: int, cells: Mapping[str, str]) -> tuple[str, Prediction | None]:
-        """Return the stream of a row and its prediction, or None for an event that is none."""
-        where = f"'{self._file}' line {line}"
-        stream = self._stream(cells.get(self._stream_column or "", ""), where)
-        start_s = _number(cells, "t", where, "seconds since the first frame of the stream", 0.0)
-        stop_s = _number(cells, "stop", where, "seconds, at least t", start_s) if self.are_events else start_s
-        named_s = start_s
-        if cells.get("named"):
-            named_s = _number(cells, "named", where, "seconds from t to stop", start_s, stop_s)
-        gesture = self._gesture(cells["label"], where)
-        score = 1.0
-        if self.scored and (gesture != NO_GESTURE or cells["score"]):
-            score = _number(cells, "score", where, "0 to 1", 0.0, 1.0)
-        affect = self._affect(cells.get("affect", ""), gesture, where)
-        if self.are_events and gesture == NO_GESTURE and affect is None:
-            return stream, None
-        return stream, Prediction(line, ReportedEvent(start_s, stop_s, gesture, named_s, affect or 0, CNN), score)
-
-    def _stream(self, name: str, where: str) -> str:
-        if name not in self._ids:
-            self._ids[name] = self._find_stream(name, where)
-        return self._ids[name]
-
-    def _find_stream(self, name: str, where: str) -> str:
-        ids = [s.id for s in self._streams]
-        if self._stream_column is None:
-            if self._alone is None:
-                raise FileFormatError(
-                    f"'{self._file}' has no column 'stream', but several streams are scored: add one with their ids "
-                    f"({shortened(ids)}), or name a single person with --subjects."
-                )
-            return self._alone
-        if self._stream_column == "stream":
-            if name not in ids:
-                raise FileFormatError(
-                    f"{where}: there is no stream '{name}' with a recording in it; accepted are {shortened(ids)}."
-                    f"{nearest(name, ids)}"
-                )
-            return name
-        theirs = [s.id for s in self._streams if s.subject == name]
-        if len(theirs) != 1:
-            people = list(dict.fromkeys(s.subject for s in self._streams))
-            problem = f"has {len(theirs)} streams ({shortened(theirs)})" if theirs else "has no stream"
-            advice = "add a column 'stream'" if theirs else f"accepted are {shortened(people)}"
-            raise FileFormatError(f"{where}: subject '{name}' {problem}: {advice}.{nearest(name, people)}")
-        return theirs[0]
-
-    def _gesture(self, label: str, where: str) -> int:
-        if label not in self._classes:
-            self._classes[label] = self._find_class(label, where)
-        return self._classes[label]
-
-    def _find_class(self, label: str, where: str) -> int:
-        """Return the class index of a label, or `NO_GESTURE` for one that means that nothing happens."""
-        found = self._gestures.find(label) or self._known.find(label)
-        if not label or (found is not None and found.idle):
-            return NO_GESTURE
-        if found in self._gestures.gestures:
-            return self._gestures.gestures.index(found)
-        if found is not None:
-            raise FileFormatError(
-                f"{where}: '{label}' is a gesture of the data set, but not one of the classes that are scored, "
-                f"{', '.join(self._gestures.labels)}: choose others with --classes, such as --classes all, or leave "
-                "the label empty."
-            )
+def _entry(table: Mapping[str, Entry], name: str, where: str, noun: str, advice: str = "") -> Entry:
+    if name not in table:
+        names = [one for one in table if one]
         raise FileFormatError(
-            f"{where}: there is no gesture '{label}' in the data set; accepted are {', '.join(self._known.labels)}, "
-            f"or nothing.{nearest(label, self._known.labels)}"
+            f"{where}: there is no {noun} '{name}'; accepted are {shortened(names)}{advice}.{nearest(name, names)}"
         )
-
-    def _affect(self, text: str, gesture: int, where: str) -> int | None:
-        """Return the code of an affect; without ``text`` that of the gesture, or None if there is none."""
-        if text:
-            try:
-                return AFFECT_CODES[text]
-            except KeyError:
-                raise FileFormatError(
-                    f"{where}: affect is '{text}': accepted are {', '.join(AFFECTS)}.{nearest(text, AFFECTS)}"
-                ) from None
-        return None if gesture == NO_GESTURE else AFFECT_CODES[self._gestures.affects[gesture]]
+    return table[name]
 
 
 def shortened(names: Sequence[str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import need
@@ -12,6 +11,8 @@ from plushsense.reports.table import DASH, Column, Table, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from plushsense.experiments.streams.run import BenchmarkResult
 
 # Okabe and Ito's colours; marker and line style distinguish the systems without colour.
 _LOOKS: dict[str, tuple[str, str, str]] = {
@@ -34,11 +35,11 @@ SETTINGS = {
 }
 
 
-def curves(result: Mapping[str, Any]) -> Figure:
+def curves(result: BenchmarkResult) -> Figure:
     """Draw false events per hour against recall for every system; a star marks a system without its threshold."""
     figure = new_figure(8.6, 6.0)
     axes = figure.add_subplot()
-    for name, system in result["systems"].items():
+    for name, system in result.systems.items():
         colour, style, marker = _LOOKS.get(name, _OTHER)
         points = sorted({(p["recall"], p["false_events_per_hour"]) for p in system["curve"]})
         drawn = [(r, f) for r, f in points if f > 0]
@@ -64,29 +65,29 @@ def curves(result: Mapping[str, Any]) -> Figure:
             )
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(need("matplotlib.ticker", "reports").FuncFormatter(lambda v, _: f"{v:g}"))
-    lowest = min((p["recall"] for s in result["systems"].values() for p in s["curve"]), default=0.0)
+    lowest = min((p["recall"] for s in result.systems.values() for p in s["curve"]), default=0.0)
     axes.set_xlim(max(0.0, int(10 * lowest) / 10 - 0.1), 1)
     axes.set_xlabel("Recall: share of true gestures answered with the right gesture")
     axes.set_ylabel("False events an hour of stream (log scale)")
     axes.grid(color="#dddddd", linewidth=0.5, which="both")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=3)
-    axes.set_title(_title(result), fontsize=10, loc="left", parse_math=False)
+    axes.set_title(result.title, fontsize=10, loc="left", parse_math=False)
     return figure
 
 
-def latencies(result: Mapping[str, Any]) -> Figure:
+def latencies(result: BenchmarkResult) -> Figure:
     """Draw the share of true gestures answered within a time of the onset, against that time.
 
     The left panel counts answers with the right gesture, the right one any event. The latter is left out where every
     sample has a label.
     """
     # If every sample has a label, there is always an event.
-    panels = [("gesture", "the right gesture"), ("anything", "any event")][: 1 if result["labelled"] else 2]
+    panels = [("gesture", "the right gesture"), ("anything", "any event")][: 1 if result.labelled else 2]
     figure = new_figure(4.8 * len(panels) + 0.6, 4.8)
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, (level, answer) in zip(grid, panels, strict=True):
-        for name, system in result["systems"].items():
+        for name, system in result.systems.items():
             colour, style, _ = _LOOKS.get(name, _OTHER)
             row = system["balanced"]
             quantiles = row["latency_shares"].get(level) or []
@@ -112,21 +113,16 @@ def latencies(result: Mapping[str, Any]) -> Figure:
     handles, labels = grid[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside lower center", ncols=2 * len(panels))
     title = (
-        f"{_title(result)}\nsettings of the highest F1 on the tuning people; the line at 1 s is the aim for the median"
+        f"{result.title}\nsettings of the highest F1 on the tuning people; the line at 1 s is the aim for the median"
     )
     figure.suptitle(title, fontsize=9).set_parse_math(False)
     return figure
 
 
-def _title(result: Mapping[str, Any]) -> str:
-    simulated = ": SIMULATION" if result["simulated"] else ""
-    return f"{result['dataset']}, {len(result['subjects'])} people left out in turn ({result['split']}){simulated}"
-
-
-def setting_table(result: Mapping[str, Any]) -> Table:
+def setting_table(result: BenchmarkResult) -> Table:
     """Return one row for each system and chosen setting."""
     rows = []
-    for system in result["systems"].values():
+    for system in result.systems.values():
         for how, setting in SETTINGS.items():
             if how not in system:
                 continue
@@ -168,23 +164,23 @@ def setting_table(result: Mapping[str, Any]) -> Table:
     return Table("settings", "Single settings", columns, tuple(rows))
 
 
-def recall_table(result: Mapping[str, Any]) -> Table:
+def recall_table(result: BenchmarkResult) -> Table:
     """Return the false events per hour of every system at equal recall, with the ratio to the reference."""
     rows = []
-    for row in result["at_recall"]:
+    for row in result.at_recall:
         cells = {"recall": f"{row['recall']:.2f}"}
-        for name in result["systems"]:
+        for name in result.systems:
             cell = row["systems"][name]
             cells[name] = rate(cell["false_events_per_hour"])
-            if cells[name] != DASH and name != result["reference"] and cell["ratio"] is not None:
+            if cells[name] != DASH and name != result.reference and cell["ratio"] is not None:
                 interval = ", 95 % {:.2f} to {:.2f}".format(*cell["ci95"]) if cell["ci95"] else ""
                 cells[name] += f" (× {cell['ratio']:.2f}{interval})"
         rows.append(cells)
-    systems = (Column(name, system["title"], "right") for name, system in result["systems"].items())
+    systems = (Column(name, system["title"], "right") for name, system in result.systems.items())
     return Table("recalls", "At equal recall", (Column("recall", "Recall", "right"), *systems), tuple(rows))
 
 
-def class_tables(result: Mapping[str, Any], how: str = "balanced") -> list[Table]:
+def class_tables(result: BenchmarkResult, how: str = "balanced") -> list[Table]:
     """Return a table for each system: one row for each gesture."""
     columns = (
         Column("label", "Gesture"),
@@ -197,7 +193,7 @@ def class_tables(result: Mapping[str, Any], how: str = "balanced") -> list[Table
         Column("p90", "90 % s", "right"),
     )
     tables = []
-    for name, system in result["systems"].items():
+    for name, system in result.systems.items():
         rows = tuple(
             {
                 **{k: row[k] for k in ("truths", "insertions")},
@@ -212,13 +208,13 @@ def class_tables(result: Mapping[str, Any], how: str = "balanced") -> list[Table
     return tables
 
 
-def point_table(result: Mapping[str, Any]) -> Table:
+def point_table(result: BenchmarkResult) -> Table:
     """Return the points of the curves and the chosen settings as numbers, for CSV."""
     names = ["system", "title", "point", "target", "recall", "precision", "f1", "false_events_per_hour"]
     names += ["latency_median_s", "latency_p90_s", "simulated"]
     rows: list[dict[str, Any]] = []
-    for name, system in result["systems"].items():
-        head = {"system": name, "title": system["title"], "simulated": "yes" if result["simulated"] else "no"}
+    for name, system in result.systems.items():
+        head = {"system": name, "title": system["title"], "simulated": "yes" if result.simulated else "no"}
         rows += [{**head, "point": "curve", **point} for point in system["curve"]]
         for how in SETTINGS:
             if how in system:
@@ -233,17 +229,17 @@ def rate(value: float | None) -> str:
     return DASH if value is None else f"{value:.0f}" if value >= 10 else f"{value:.1f}"
 
 
-def page(result: Mapping[str, Any]) -> str:
+def page(result: BenchmarkResult) -> str:
     """Return the benchmark as one self-contained HTML page."""
     return render_page(
         "streams.html.j2",
-        title=f"PlushSense continuous benchmark: {result['dataset']}",
-        simulated=result["simulated"],
-        note=result["note"],
-        late_s=f"{result['late_s']:g}",
-        people=", ".join(result["subjects"]),
-        n=len(result["subjects"]),
-        split=result["split"],
+        title=f"PlushSense continuous benchmark: {result.dataset}",
+        simulated=result.simulated,
+        note=result.note,
+        late_s=f"{result.late_s:g}",
+        people=", ".join(result.subjects),
+        n=len(result.subjects),
+        split=result.split,
         settings=setting_table(result),
         recalls=recall_table(result),
         classes=class_tables(result),

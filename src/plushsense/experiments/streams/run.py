@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,14 +22,13 @@ from plushsense.core.errors import (
     need,
     python_warning,
 )
-from plushsense.core.files import temporary_folder, write_file
+from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
-from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.index import as_dataset
-from plushsense.dataset.store import HEAD, Dataset, StreamInfo
+from plushsense.dataset.store import Dataset, StreamInfo
 from plushsense.deploy.quantize import calibration
+from plushsense.experiments.recordings import opened
 from plushsense.experiments.streams.predictions import (
     StreamPredictions,
     check_events_path,
@@ -53,6 +51,7 @@ from plushsense.experiments.streams.score import (
     Fitted,
     PeopleFold,
     Settings,
+    SystemScores,
     crossvalidated_streams,
     people_folds,
     pooled_scores,
@@ -166,10 +165,8 @@ class TrainStreams:
         }
 
 
-def recipes_for(
-    dataset: Dataset, run: Run, networks: Collection[str], anywhere_pool_s: float | None, warn: Warn = silent
-) -> dict[str, Recipe]:
-    """Return the recipe of each network in ``networks``; they differ in windows, classes, epochs and perhaps the pool.
+def recipes_for(dataset: Dataset, run: Run, networks: Collection[str], warn: Warn = silent) -> dict[str, Recipe]:
+    """Return the recipe of each network in ``networks``; they differ in windows, classes and epochs.
 
     The context "anywhere" gives several times as many windows, so that half the epochs are still more training steps.
     """
@@ -185,11 +182,7 @@ def recipes_for(
         recipes[WINDOWS] = Recipe(arch, training, run.scored_on, gestures)
     if ANYWHERE in networks:
         gestures = classes_for(dataset, classes, "anywhere", warn if WINDOWS not in networks else silent)
-        pool = run.network.pool
-        if anywhere_pool_s is not None:
-            replace(run.model, pool_s=anywhere_pool_s)  # refuses what is no pool
-            pool = dataset.layout.samples(anywhere_pool_s)
-        arch = replace(run.network, classes=len(gestures), pool=pool)
+        arch = replace(run.network, classes=len(gestures))
         halved = replace(training, epochs=-(-training.epochs // 2))
         if training.halve_every:
             halved = replace(halved, halve_every=-(-training.halve_every // 2))
@@ -230,21 +223,6 @@ def describe_false_events(dataset: Dataset) -> str:
         return SIMULATED_RATES
     labelled = {s.stream for s in dataset.stretches}
     return LABELLED_RATES.format(labelled=len(labelled), streams=len(dataset.streams)) if labelled else UPPER_BOUND
-
-
-@contextmanager
-def streams_at(path: str | os.PathLike[str], bundle: Bundle | None = None) -> Iterator[Dataset]:
-    """Open the data set at ``path``, or import a folder of GestureRecorder files as a temporary data set.
-
-    Such a folder gets the layout and the gestures of ``bundle``; by default those that its files and labels suggest.
-    """
-    place = Path(path)
-    if (place / HEAD).is_file() or not place.is_dir():
-        yield as_dataset(place)
-        return
-    with temporary_folder() as folder:
-        layout, gestures = (None, None) if bundle is None else (bundle.layout, bundle.gestures)
-        yield import_recordings(place, folder / "DS", layout=layout, gestures=gestures, adopt_proposals=False).dataset
 
 
 def _people_of(dataset: Dataset, path: str | os.PathLike[str], subjects: Sequence[str] | None) -> list[str]:
@@ -383,7 +361,7 @@ def stream_eval(
     if events is not None:
         check_events_path(events)
     bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
-    with streams_at(path, bundle) as dataset:
+    with opened(path, bundle.layout, bundle.gestures) as dataset:
         dataset = dataset if labels else dataset.without_stretches()
         dataset = dataset.with_inputs(bundle.layout).with_gestures(bundle.gestures)
         if dataset.layout.inputs != bundle.layout.inputs:
@@ -470,7 +448,7 @@ def score_predictions(
     """
     if not 0.0 <= threshold <= 1.0:
         raise ConfigError(f"The threshold is {threshold:g}: accepted are 0 to 1, as for scores.")
-    with streams_at(path) as dataset:
+    with opened(path) as dataset:
         dataset, classes = named_classes(dataset if labels else dataset.without_stretches(), classes)
         gestures = choose_classes(dataset, classes, warn)
         there = scored_streams(dataset, _people_of(dataset, path, subjects))
@@ -530,14 +508,12 @@ class BenchmarkSpec:
         systems: names of `plushsense.experiments.streams.systems.SYSTEMS`; by default all.
         late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
         labels: whether to train and score with the labels of stretches between recordings (`Dataset.stretches`).
-        anywhere_pool_s: pooling time in seconds of the networks of stream training (default: that of the others).
     """
 
     split: str = SPLIT
     systems: Sequence[str] | None = None
     late_s: float = LATE_S
     labels: bool = True
-    anywhere_pool_s: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -545,6 +521,48 @@ class BenchmarkSpec:
         for name in self.systems or ():
             check_known(name, SYSTEMS, "system", ConfigError)
         return tuple(name for name in SYSTEMS if self.systems is None or name in self.systems)
+
+
+@dataclass(frozen=True)
+class BenchmarkResult(SystemScores):
+    """The result of `stream_benchmark`: the scores of the systems, and what they were made of.
+
+    ``labelled`` tells whether every sample of the streams has a label; ``networks`` has the title of each network.
+    """
+
+    split: str
+    dataset: str
+    dataset_hash: str
+    simulated: bool
+    labelled: bool
+    note: str
+    late_s: float
+    labelled_stretches: int
+    subjects: Sequence[str]
+    code_version: str
+    seed: int
+    networks: Mapping[str, str]
+    anywhere: Mapping[str, Any]
+    preset: str
+    training: Mapping[str, Any]
+
+    @property
+    def title(self) -> str:
+        """Data, people and split in one line."""
+        people = f"{len(self.subjects)} people left out in turn ({self.split})"
+        return f"{self.dataset}, {people}{': SIMULATION' * self.simulated}"
+
+    def save(self, out: Path) -> None:
+        """Write JSON, CSV with a row for each point of a curve, a page and its figures to a folder."""
+        from plushsense.experiments.streams.report import curves, latencies, page, point_table
+        from plushsense.reports.figures import png
+
+        out.mkdir(parents=True, exist_ok=True)
+        write_file(out / SHEET, point_table(self).csv())
+        (out / CURVES).write_bytes(png(curves(self), dpi=130))
+        (out / LATENCIES).write_bytes(png(latencies(self), dpi=130))
+        write_file(out / PAGE, page(self))
+        write_file(out / TABLE, json.dumps(vars(self), ensure_ascii=False, indent=1))
 
 
 def stream_benchmark(
@@ -557,7 +575,7 @@ def stream_benchmark(
     progress: Progress | None = None,
     warn: Warn = python_warning,
     **settings: Any,
-) -> dict[str, Any]:
+) -> BenchmarkResult:
     """Score every system on the streams of people left out, with settings tuned on other people.
 
     In each fold, networks are trained on the training people, every system is tuned on the validation people, and
@@ -566,9 +584,6 @@ def stream_benchmark(
     Args:
         config, settings, warn: as for `train`; also ``workers``.
         out: a folder for the table as JSON and CSV, a page, and its figures.
-
-    Returns:
-        what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note`` and the settings.
     """
     spec = spec or BenchmarkSpec()
     run = prepare(dataset, config or from_settings(**settings))
@@ -579,7 +594,7 @@ def stream_benchmark(
         need("jinja2", extra="reports")
         check_results(Path(out), "A benchmark", TABLE, replace=overwrite)
     people_folds(dataset, spec.split, seed)  # raises before anything is trained
-    recipes = recipes_for(dataset, run, {SYSTEMS[n].network for n in names}, spec.anywhere_pool_s, warn)
+    recipes = recipes_for(dataset, run, {SYSTEMS[n].network for n in names}, warn)
     fit = TrainStreams(recipes, any(SYSTEMS[n].gate_to for n in names), dataset.path / CACHE / "stream-networks")
     folds = crossvalidated_streams(
         dataset,
@@ -592,44 +607,25 @@ def stream_benchmark(
         progress=progress,
     )
     tested = {person for fold in folds for person in fold["test"]}
-    table = {
-        **_described(dataset, spec),
-        "subjects": sorted(tested & set(people_with_streams(dataset))),
-        "code_version": __version__,
-        **summed(folds),
-        "seed": seed,
-        "networks": {name: recipe.arch.title for name, recipe in recipes.items()},
-        "anywhere": {"pool_s": spec.anywhere_pool_s, **vars(run.anywhere)},
-        "preset": run.preset,
-        "training": run.training.to_dict(),
-    }
+    result = BenchmarkResult(
+        **vars(summed(folds)),
+        split=spec.split,
+        dataset=dataset.head.name,
+        dataset_hash=dataset.hash,
+        simulated=dataset.head.simulated,
+        labelled=dataset.layout.is_labelled,
+        note=describe_false_events(dataset),
+        late_s=spec.late_s,
+        labelled_stretches=len(dataset.stretches),
+        subjects=sorted(tested & set(people_with_streams(dataset))),
+        code_version=__version__,
+        seed=seed,
+        networks={name: recipe.arch.title for name, recipe in recipes.items()},
+        anywhere=dict(vars(run.anywhere)),
+        preset=run.preset,
+        training=run.training.to_dict(),
+    )
     if out is not None:
         with dataset.generation.writing():
-            save_benchmark(table, Path(out))
-    return table
-
-
-def _described(dataset: Dataset, spec: BenchmarkSpec) -> dict[str, Any]:
-    return {
-        "split": spec.split,
-        "dataset": dataset.head.name,
-        "dataset_hash": dataset.hash,
-        "simulated": dataset.head.simulated,
-        "labelled": dataset.layout.is_labelled,
-        "note": describe_false_events(dataset),
-        "late_s": spec.late_s,
-        "labelled_stretches": len(dataset.stretches),
-    }
-
-
-def save_benchmark(table: dict[str, Any], out: Path) -> None:
-    """Write a benchmark to a folder: JSON, CSV with a row for each point of a curve, a page and its figures."""
-    from plushsense.experiments.streams.report import curves, latencies, page, point_table
-    from plushsense.reports.figures import png
-
-    out.mkdir(parents=True, exist_ok=True)
-    write_file(out / SHEET, point_table(table).csv())
-    (out / CURVES).write_bytes(png(curves(table), dpi=130))
-    (out / LATENCIES).write_bytes(png(latencies(table), dpi=130))
-    write_file(out / PAGE, page(table))
-    write_file(out / TABLE, json.dumps(table, ensure_ascii=False, indent=1))
+            result.save(Path(out))
+    return result

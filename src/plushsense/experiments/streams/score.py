@@ -152,7 +152,7 @@ def crossvalidated_streams(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Result]:
-    """Fit, tune and score each fold; return the counts of each, from which `summed` makes the table.
+    """Fit, tune and score each fold; return the counts of each, from which `summed` makes the scores.
 
     Args:
         split: "by-subject:5", "leave-one-subject-out".
@@ -194,12 +194,12 @@ class _FoldWork:
 
         fitted = self.fit(shared, task, progress)
         fitted_s = time.perf_counter() - began
-        table = scored_fold(shared, task, fitted, self.settings)
+        table = _scored_fold(shared, task, fitted, self.settings)
         seconds = {"fit": round(fitted_s, 1), "score": round(time.perf_counter() - began - fitted_s, 1)}
         return {**table, "fitted": dict(fitted.report), "seconds": seconds}
 
 
-def scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Settings) -> dict[str, Any]:
+def _scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Settings) -> dict[str, Any]:
     """Tune every system on a fold's validation people and score it on the test people; return counts for JSON."""
     systems: dict[str, Any] = {}
     for network in (WINDOWS, ANYWHERE):
@@ -238,10 +238,8 @@ def _scored(
     for h in testing:
         by_person.setdefault(h.truth.subject, []).append(h)
 
-    def outcome(spec: DecideSpec) -> dict[str, Any]:
-        return {
-            person: total(streams, spec, settings.weights, late_s).to_journal() for person, streams in by_person.items()
-        }
+    def outcome(spec: DecideSpec) -> Mapping[str, Mapping[str, Any]]:
+        return {who: total(mine, spec, settings.weights, late_s).to_journal() for who, mine in by_person.items()}
 
     curve: list[dict[str, Any]] = []
     of_spec: dict[int, dict[str, Any]] = {}
@@ -289,8 +287,9 @@ LATENCY_SHARES = tuple(n / 20 for n in range(21))
 Folds = Sequence[Mapping[str, Any]]
 
 
-def summed(folds: Folds) -> dict[str, Any]:
-    """Sum the counts of all folds and return the benchmark's table, ready for JSON.
+@dataclass(frozen=True)
+class SystemScores:
+    """The scores of the systems of the benchmark over all test people, as plain values.
 
     Each of ``systems`` has a ``curve`` (for each target, recall and false events per hour over all test people) and the
     figures of the settings ``balanced`` (highest F1 on the tuning people), ``prompt`` (shortest median latency, at
@@ -298,6 +297,15 @@ def summed(folds: Folds) -> dict[str, Any]:
     perhaps ``plain`` (no threshold). ``at_recall`` has the false events per hour of all systems at equal recall, and
     their ratio to the reference with a 95 % bootstrap interval over people.
     """
+
+    systems: Mapping[str, Mapping[str, Any]]
+    reference: str | None
+    at_recall: Sequence[Mapping[str, Any]]
+    folds: Sequence[Mapping[str, Any]]
+
+
+def summed(folds: Folds) -> SystemScores:
+    """Sum the counts of all folds."""
     names = [n for n in SYSTEMS if all(n in fold["systems"] for fold in folds)]
     counts = {n: _counts(folds, n) for n in names}
     systems = {}
@@ -307,16 +315,14 @@ def summed(folds: Folds) -> dict[str, Any]:
             if all(how in fold["systems"][n] for fold in folds):
                 parts[how] = _outcome(folds, n, how)
         systems[n] = parts
-    return {
-        "systems": systems,
-        "reference": REFERENCE if REFERENCE in names else None,
-        "at_recall": _at_recall(counts) if REFERENCE in names else [],
-        "folds": [
-            {k: v for k, v in fold.items() if k != "systems"}
-            | {"settings": {n: {how: fold["systems"][n][how]["tuned"] for how in CHOICES} for n in names}}
-            for fold in folds
-        ],
-    }
+    described = [
+        {k: v for k, v in fold.items() if k != "systems"}
+        | {"settings": {n: {how: fold["systems"][n][how]["tuned"] for how in CHOICES} for n in names}}
+        for fold in folds
+    ]
+    if REFERENCE not in names:
+        return SystemScores(systems, None, [], described)
+    return SystemScores(systems, REFERENCE, _at_recall(counts), described)
 
 
 def _counts(folds: Folds, name: str) -> NDArray[np.float64]:

@@ -11,14 +11,11 @@ import numpy as np
 
 from plushsense.core.errors import need
 from plushsense.experiments.sweep.grid import CHOSEN, SECOND
-from plushsense.experiments.sweep.results import StoredSweep, finite, name_of
+from plushsense.experiments.sweep.results import SweepResult, name_of
 from plushsense.experiments.sweep.tables import (
     COSTS,
     ArchitectureScores,
     architectures,
-    batches,
-    effect,
-    epochs,
     pareto_points,
     table4,
     top_rows,
@@ -43,7 +40,6 @@ CLASSES = (
     ("X", "#f0e442"),
     ("h", "#7f7f7f"),
 )
-_STYLES = ("-", "--", ":", "-.")
 BARS = 30
 """Largest number of architectures in a bar chart; of more only the best are drawn, so that it stays legible."""
 _BAR_WITH_VALUE = 10.0
@@ -57,12 +53,12 @@ NAMED = 14
 """Largest number of points of a Pareto front that are labelled."""
 
 
-def about(sweep: StoredSweep) -> str:
+def about(sweep: SweepResult) -> str:
     """Return the line below a figure: data set, split, number of runs, and whether it is leaky or simulated."""
     parts = [
         f"data: {sweep.head.get('dataset') or '?'}",
         f"split {sweep.head.get('split') or '?'}" + (" (LEAKY)" if sweep.leaky else ""),
-        describe_runs(sweep.trials),
+        describe_runs(sweep.rows),
     ]
     if len(sweep.done) < sweep.total:
         parts.append(f"{len(sweep.done)} of {sweep.total} trials done")
@@ -71,14 +67,14 @@ def about(sweep: StoredSweep) -> str:
     return " · ".join(parts)
 
 
-def _figure(sweep: StoredSweep, width: float, height: float, title: str) -> Figure:
+def _figure(sweep: SweepResult, width: float, height: float, title: str) -> Figure:
     figure = figures.new_figure(width, height)
     figure.suptitle(title, fontsize=11, x=0.01, ha="left").set_parse_math(False)
     _describe_below(figure, sweep)
     return figure
 
 
-def _describe_below(figure: Figure, sweep: StoredSweep) -> None:
+def _describe_below(figure: Figure, sweep: SweepResult) -> None:
     warned = sweep.leaky or sweep.simulated
     colour, weight = ("#b3261e", "bold") if warned else ("#57606a", "normal")
     lines = textwrap.fill(about(sweep), round(_LETTERS_AN_INCH * figure.get_figwidth()), break_on_hyphens=False)
@@ -86,12 +82,12 @@ def _describe_below(figure: Figure, sweep: StoredSweep) -> None:
     text.set_parse_math(False)
 
 
-def score_label(sweep: StoredSweep, measure: str) -> str:
+def score_label(sweep: SweepResult, measure: str) -> str:
     marks = ["leaky"] * sweep.leaky + ["simulation"] * sweep.simulated
     return f"{measure}{', ' + ', '.join(marks) if marks else ''}"
 
 
-def by_architecture(sweep: StoredSweep) -> Figure:
+def by_architecture(sweep: SweepResult) -> Figure:
     """Draw the paper's Figure 7: highest and mean accuracy of each architecture, and its size with the most filters."""
     rows = _best(architectures(sweep))
     title = f"{LIKE.format(7)}: accuracy of each architecture, and its size"
@@ -111,7 +107,7 @@ def by_architecture(sweep: StoredSweep) -> Figure:
     return figure
 
 
-def by_filters(sweep: StoredSweep) -> Figure:
+def by_filters(sweep: SweepResult) -> Figure:
     """Draw the paper's Figure 8: the bars of Figure 7 in one panel for each filter set, the largest set first."""
     sets = sweep.filter_sets[::-1]
     names = [row.arch for row in _best(architectures(sweep))]
@@ -171,7 +167,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8, frameon=False)
 
 
-def size_and_accuracy(sweep: StoredSweep) -> Figure:
+def size_and_accuracy(sweep: SweepResult) -> Figure:
     """Draw the paper's Figure 9: accuracy against the number of parameters, for the networks of Table 4."""
     rows = top_rows(table4(sweep))
     figure = _figure(sweep, 9.2, 5.2, f"{LIKE.format(9)}: accuracy and size of the best of each size class")
@@ -191,7 +187,7 @@ def size_and_accuracy(sweep: StoredSweep) -> Figure:
     return figure
 
 
-def pareto(sweep: StoredSweep, cost: str) -> Figure:
+def pareto(sweep: SweepResult, cost: str) -> Figure:
     """Draw the best macro-F1 of each network against a cost, with the Pareto front as a line with labelled points."""
     points = pareto_points(sweep, cost)
     label = COSTS[cost]
@@ -236,52 +232,7 @@ def _class_legend(axes: Axes) -> None:
     axes.legend(title="filters", fontsize=8, title_fontsize=8, **place)
 
 
-def schedules(sweep: StoredSweep) -> Figure:
-    """Draw accuracy and macro-F1 by epochs and batch: means over the networks, with standard deviations as bars."""
-    rows = effect(sweep).rows
-    lengths, sizes = epochs(sweep), batches(sweep)
-    # The axis shows the epochs, with a line for each batch; if only the batch varies, the axis shows the batch.
-    along, lines = (lengths, sizes) if len(lengths) > 1 else (sizes, lengths)
-    keys = ("epochs", "batch_asked") if len(lengths) > 1 else ("batch_asked", "epochs")
-    axis, each = ("Epochs", "batch") if len(lengths) > 1 else ("Batch", "epochs")
-    figure = _figure(sweep, 9.2, 4.0, "Effect of epochs and batch: means over the networks, bars ± 1 sd")
-    for axes, measure, label, scale in zip(
-        figure.subplots(1, 2),
-        ("accuracy", "macro_f1"),
-        ("Mean accuracy (% of test windows)", "Mean macro-F1 (0 to 1)"),
-        (100.0, 1.0),
-        strict=True,
-    ):
-        for i, line in enumerate(lines):
-            marker, colour = CLASSES[i % len(CLASSES)]
-            mine = {r[keys[0]]: r for r in rows if r[keys[1]] == line}
-            at = [k for k, value in enumerate(along) if value in mine and finite(mine[value][measure])]
-            mean = [scale * mine[along[k]][measure] for k in at]
-            sd = [scale * (mine[along[k]][f"{measure}_sd"] or 0.0) for k in at]
-            shift = (i - (len(lines) - 1) / 2) * 0.09
-            axes.errorbar(
-                np.array(at) + shift,
-                mean,
-                yerr=sd,
-                marker=marker,
-                linestyle=_STYLES[i % len(_STYLES)],
-                color=colour,
-                markeredgecolor="black",
-                capsize=3,
-                label=f"{each} {line}",
-            )
-        axes.set_xticks(range(len(along)), [str(value) for value in along])
-        axes.set_xlim(-0.5, len(along) - 0.5)
-        axes.set_xlabel(axis, fontsize=9)
-        axes.set_ylabel(score_label(sweep, label), fontsize=9)
-        axes.tick_params(labelsize=8)
-        axes.grid(axis="y", color="#dddddd", linewidth=0.5)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(fontsize=8, frameon=False)
-    return figure
-
-
-def curves(sweep: StoredSweep, trial: Row) -> Figure | None:
+def curves(sweep: SweepResult, trial: Row) -> Figure | None:
     """Draw the learning curves of a trial in training and validation; None if none were stored."""
     histories = sweep.histories(trial)
     if not histories:
@@ -291,7 +242,7 @@ def curves(sweep: StoredSweep, trial: Row) -> Figure | None:
     return figure
 
 
-def confusion(sweep: StoredSweep, trial: Row) -> Figure | None:
+def confusion(sweep: SweepResult, trial: Row) -> Figure | None:
     """Draw a confusion matrix as in the paper's Figures 10 and 11, with classes sorted and framed by affect."""
     counts = sweep.confusion(str(trial["trial"]))
     if counts is None:
@@ -328,7 +279,7 @@ def affect_order(affects: Sequence[str]) -> list[int]:
     return sorted(range(len(affects)), key=lambda i: (ranks[affects[i]], i))
 
 
-def _by_class(sweep: StoredSweep) -> list[tuple[str, tuple[str, str]]]:
+def _by_class(sweep: SweepResult) -> list[tuple[str, tuple[str, str]]]:
     """Return each filter set with its marker and colour."""
     return [(s, CLASSES[i % len(CLASSES)]) for i, s in enumerate(sweep.filter_sets)]
 

@@ -11,6 +11,7 @@ import contextlib
 import math
 import os
 import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -404,7 +405,8 @@ def load_grid(
 
     Args:
         grid: a `GridSpec`, the name of one of `GRIDS`, or the path of a TOML file.
-        changes: new values of keys, also as text of the command line; None leaves a key as it is.
+        changes: new values of keys, also as text: TOML, or items joined by commas (filters: ``4/6/8/8,8/12/16/16``);
+            None leaves a key as it is.
 
     Returns:
         the grid, and a sentence for each key or value that cannot be read and is therefore ignored.
@@ -444,43 +446,42 @@ def _read_table(path: Path) -> tuple[Mapping[str, Any], list[str]]:
 
 
 def _changed(grid: GridSpec, table: Mapping[str, Any], where: str) -> tuple[GridSpec, list[str]]:
-    """Return ``grid`` with the values of ``table``, and a message for each wrong key or value.
+    """Return ``grid`` with the values of ``table``, and a message for each wrong key or value; None keeps a value.
 
-    Values may be text as on the command line, with commas between the items of a list; None keeps the value of
-    ``grid``. If one item of a list is wrong, the others are kept, so that their problems are found as well.
+    If one item of a list is wrong, the others are kept, so that their problems are found as well.
     """
     kinds = get_type_hints(GridSpec)
-    parsed = {key: _from_text(key, value, kinds.get(key)) for key, value in table.items() if value is not None}
+    parsed = {key: _parsed(key, value, kinds.get(key)) for key, value in table.items() if value is not None}
     values, wrong = check_table(parsed, GridSpec, where)
     return replace(grid, **values), wrong
 
 
-def _from_text(key: str, value: Any, kind: Any) -> Any:
-    """Convert a value of a table, if it is text, to the number or list that ``kind`` requires."""
-    if key == "filters":
-        return _filter_sets(value)
+def _parsed(key: str, value: Any, kind: Any) -> Any:
+    """Return a value as the type ``kind`` needs it; a text may be TOML, or the items of a list joined by commas."""
+    listed = next((one for one in (kind, *get_args(kind)) if get_origin(one) is tuple), None)
+    texts = str in (kind, *get_args(kind), *get_args(listed))
+    if isinstance(value, str) and listed is not None and "[" not in value:
+        parts = [value] if key == "filters" and "/" not in value else value.split(",")
+        value = [part.strip() if texts or key == "filters" else _toml(part) for part in parts]
+    elif isinstance(value, str) and (listed is not None or not texts):
+        value = _toml(value)
     if key == "classes" and isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
         return ",".join(value)
-    if get_origin(kind) is tuple:
-        items = [part.strip() for part in value.split(",")] if isinstance(value, str) else value
-        if not isinstance(items, list | tuple):
-            return items
-        return [_from_text("", item, get_args(kind)[0]) for item in items]
-    if isinstance(value, str) and kind is not str:
-        for number in (int, float)[: 2 if float in (kind, *get_args(kind)) else 1]:
-            with contextlib.suppress(ValueError):
-                return number(value)
+    if key == "filters" and isinstance(value, list | tuple):
+        return [_filter_set(item) for item in value]
     return value
 
 
-def _filter_sets(value: Any) -> Any:
-    """Parse filter sets as a list of lists; the text ``4,6,8,8`` is one set, ``4/6/8/8,8/12/16/16`` are two."""
-    if isinstance(value, str):
-        value = [part.strip() for part in value.split(",")] if "/" in value else [value]
-    if not isinstance(value, list | tuple):
-        return value
-    sets = list(value)
-    for n, item in enumerate(sets):
-        with contextlib.suppress(ArchError):
-            sets[n] = parse_filters(item.replace("/", ",")) if isinstance(item, str) else item
-    return sets
+def _toml(text: str) -> Any:
+    """Return the value of a TOML text; one that is not TOML is the value itself."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _filter_set(item: Any) -> Any:
+    """Return one set of filters, also from a text such as ``4/6/8/8``."""
+    with contextlib.suppress(ArchError):
+        return parse_filters(str(item).replace("/", ",")) if isinstance(item, str | int) else item
+    return item

@@ -239,12 +239,6 @@ class Halving:
         """The network with the highest macro-F1 among those that were trained to the end."""
         return self.networks[self.found.best][-1]
 
-    @property
-    def smallest_equal(self) -> TrialResult:
-        """The smallest network within one standard error of the best."""
-        equal = [self.networks[n][-1] for n in (self.found.best, *self.found.equals)]
-        return min(equal, key=lambda result: result.trial.arch.parameters)
-
     def training_config(self) -> str:
         """Return the configuration file with which ``plushsense train`` trains the winner."""
         trial, grid = self.winner.trial, self.winner.head.grid
@@ -266,11 +260,12 @@ class Halving:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, as in ``sweep.json``."""
+        equal = [self.networks[n][-1] for n in (self.found.best, *self.found.equals)]
         return {
             "rungs": [self._rung(finished) for finished in self.found.rungs],
             "winner": self.winner.row(),
-            "smallest_equal": self.smallest_equal.row(),
-            "equal": [self.networks[network][-1].trial.id for network in self.found.equals],
+            "smallest_equal": min(equal, key=lambda result: result.trial.arch.parameters).row(),
+            "equal": [result.trial.id for result in equal[1:]],
             "cost": {
                 "macs": self.found.spent,
                 "bound_macs": self.costs.bound,

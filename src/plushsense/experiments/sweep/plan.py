@@ -151,7 +151,7 @@ def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
             warn(
                 Message(
                     "{n} of the {of} classes are gestures that fewer than 90 % of the people made ({gestures}): the "
-                    "tested person may be the only one with a class; leave these classes out with --classes shared",
+                    "tested person may be the only one with a class; leave these classes out with --set classes=shared",
                     n=len(rare),
                     of=len(cut.gestures),
                     gestures=sorted(rare),
@@ -269,10 +269,7 @@ def _within_limits(
             "networks."
         )
     if beyond:
-        filters: dict[str, list[str]] = {}
-        for arch in beyond:
-            filters.setdefault(arch.symbol, []).append(slashed(arch.filters))
-        named = "; ".join(f"{symbol} with {', '.join(several)}" for symbol, several in filters.items())
+        named = "; ".join(f"{arch.symbol} with {slashed(arch.filters)}" for arch in beyond)
         warn(
             Message(
                 "{n} of {of} networks are beyond the limits and left out: {names}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from plushsense.experiments.sweep import figures as draw
 from plushsense.experiments.sweep import tables
 from plushsense.experiments.sweep.folder import SUMMARY
 from plushsense.experiments.sweep.grid import GRID_TRAINING
-from plushsense.experiments.sweep.results import StoredSweep, file_name_of, name_of, read_sweep
+from plushsense.experiments.sweep.results import SweepResult, file_name_of, name_of, read_sweep
 from plushsense.reports import wording
 from plushsense.reports.figures import png, svg, svg_uri
 from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
@@ -25,8 +25,6 @@ from plushsense.training.spec import PRESETS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from plushsense.experiments.sweep.mlflow import MlflowResult
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class Drawing:
 class Section:
     """A section of the page: tables, figures, and in ``dropped`` sentences on what is left out, and why.
 
-    ``files`` and ``more_drawings`` are written as files only.
+    ``files`` are tables that are written as files only.
     """
 
     key: str
@@ -52,10 +50,9 @@ class Section:
     dropped: tuple[str, ...] = ()
     scores: bool = True
     files: tuple[Table, ...] = ()
-    more_drawings: tuple[Drawing, ...] = ()
 
 
-def sections_of(sweep: StoredSweep) -> Iterator[Section]:
+def sections_of(sweep: SweepResult) -> Iterator[Section]:
     """Yield the sections of the report in the paper's order; without any finished trial, only those without scores."""
     if not sweep.done:
         yield Section("best", "The best trials", dropped=("No trial is done yet: there is no score to show.",))
@@ -63,7 +60,7 @@ def sections_of(sweep: StoredSweep) -> Iterator[Section]:
         return
     best = sweep.best
     assert best is not None
-    yield Section("best", "The best trials", (tables.best_trials(sweep),))
+    yield Section("best", "The best trials", (sweep.best_table(),))
     yield _overview(sweep)
     yield _parameters(sweep)
     yield _by_filters(sweep)
@@ -75,11 +72,11 @@ def sections_of(sweep: StoredSweep) -> Iterator[Section]:
     yield _fronts(sweep)
 
 
-def _parameters(sweep: StoredSweep) -> Section:
+def _parameters(sweep: SweepResult) -> Section:
     return Section("table-3", "Parameters (the paper's Table 3)", (tables.table3(sweep),), scores=False)
 
 
-def _overview(sweep: StoredSweep) -> Section:
+def _overview(sweep: SweepResult) -> Section:
     rows = tables.architectures(sweep)
     best = max(rows, key=lambda row: row.highest or 0.0)
     alt = (
@@ -91,7 +88,7 @@ def _overview(sweep: StoredSweep) -> Section:
     return Section("figure-7", title, (tables.architecture_table(sweep),), (drawing,), _only_best(len(rows)))
 
 
-def _by_filters(sweep: StoredSweep) -> Section:
+def _by_filters(sweep: SweepResult) -> Section:
     title = "Accuracy by filter set (the paper's Figure 8)"
     if len(sweep.filter_sets) < 2:
         return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
@@ -109,7 +106,7 @@ def _only_best(architectures: int) -> tuple[str, ...]:
     return (f"Drawn are the best {draw.BARS} of {architectures} architectures; the CSV has all.",)
 
 
-def _top(sweep: StoredSweep) -> Section:
+def _top(sweep: SweepResult) -> Section:
     table = tables.table4(sweep)
     title = "The best of each size class (the paper's Table 4 and Figure 9)"
     if len(table.rows) < 2:
@@ -120,29 +117,20 @@ def _top(sweep: StoredSweep) -> Section:
     return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
 
 
-def _effect(sweep: StoredSweep) -> Section:
+def _effect(sweep: SweepResult) -> Section:
     title, table = "Effect of epochs and batch", tables.effect(sweep)
-    if len(tables.epochs(sweep)) * len(tables.batches(sweep)) < 2:
-        dropped = ("All trials have the same epochs and batch: there is nothing to compare.",)
-        return Section("effect", title, dropped=dropped)
     if len(table.rows) < 2:
-        dropped = ("One schedule only is scored yet: there is nothing to compare.",)
-        return Section("effect", title, (table,), dropped=dropped)
-    alt = "Lines: mean accuracy and macro-F1 over the networks by epochs and batch; the table has the numbers."
-    return Section("effect", title, (table,), (Drawing("effect", draw.schedules(sweep), alt),))
+        return Section("effect", title, dropped=("One schedule only is scored: there is nothing to compare.",))
+    return Section("effect", title, (table,))
 
 
-def _looked_at(sweep: StoredSweep, best: Row) -> list[Row]:
+def _looked_at(sweep: SweepResult, best: Row) -> list[Row]:
     """Return the trials to show with confusions and curves: the paper's two networks if in the grid, and the best."""
     candidates = [*(sweep.best_of(*network) for network in draw.PAPER_CONFUSIONS), best]
     return list({t["trial"]: t for t in candidates if t}.values())
 
 
-_MATRICES = 12
-"""Largest number of confusion matrices on the page; all are files."""
-
-
-def _confusions(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
+def _confusions(sweep: SweepResult, trials: Sequence[Row]) -> Section:
     title = "Confusions (the paper's Figures 10 and 11)"
     if len(sweep.labels) < 2:
         return Section("confusion", title, dropped=("The sweep names no classes: there is nothing to confuse.",))
@@ -162,20 +150,10 @@ def _confusions(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
         counts.append(tables.confusion_table(sweep, trial, name))
     if by_gesture and set(sweep.affects) == {"none"}:
         dropped.append("The gestures of this data set have no affect: there are no blocks.")
-    if more := len(drawings[_MATRICES:]):
-        dropped.append(f"{more} more confusion matrices are in the files only, with their tables.")
-    return Section(
-        "confusion",
-        title,
-        tuple(by_gesture[:_MATRICES]),
-        tuple(drawings[:_MATRICES]),
-        tuple(dropped),
-        files=(*counts, *by_gesture[_MATRICES:]),
-        more_drawings=tuple(drawings[_MATRICES:]),
-    )
+    return Section("confusion", title, tuple(by_gesture), tuple(drawings), tuple(dropped), files=tuple(counts))
 
 
-def confusion_words(sweep: StoredSweep, trial: Row) -> str:
+def confusion_words(sweep: SweepResult, trial: Row) -> str:
     """Describe a confusion matrix in words: shares that are right, wrong within an affect, and wrong across affects."""
     counts = np.asarray(sweep.confusion(str(trial["trial"])), dtype=np.int64)
     total, right = int(counts.sum()), int(np.trace(counts))
@@ -196,7 +174,7 @@ def confusion_words(sweep: StoredSweep, trial: Row) -> str:
     return description + (f". {draw.LIKE.format(number)}." if number else ".")
 
 
-def _curves(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
+def _curves(sweep: SweepResult, trials: Sequence[Row]) -> Section:
     drawings, dropped = [], []
     for trial in trials:
         figure = draw.curves(sweep, trial)
@@ -208,7 +186,7 @@ def _curves(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
     return Section("curves", "Learning curves", drawings=tuple(drawings), dropped=tuple(dropped))
 
 
-def _fronts(sweep: StoredSweep) -> Section:
+def _fronts(sweep: SweepResult) -> Section:
     drawings, dropped = [], []
     for cost, label in tables.COSTS.items():
         points = tables.pareto_points(sweep, cost)
@@ -242,15 +220,11 @@ class ReportResult:
     n_files: int
     trials: int
     done: int
-    mlflow: MlflowResult | None = None
 
     @property
     def summary(self) -> list[str]:
         """What was written, in words."""
-        lines = [f"{self.n_files} tables and figures in {self.files}"]
-        if (logged := self.mlflow) is not None:
-            lines.append(f"MLflow: {logged.new} trials logged, {logged.before} were there already ({logged.uri})")
-        return lines
+        return [f"{self.n_files} tables and figures in {self.files}"]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
@@ -259,7 +233,6 @@ class ReportResult:
             "files": str(self.files),
             "trials": self.trials,
             "done": self.done,
-            "mlflow": None if self.mlflow is None else asdict(self.mlflow),
             "said": self.summary,
         }
 
@@ -269,7 +242,6 @@ def write_sweep_report(
     page: str | os.PathLike[str] | None = None,
     *,
     title: str | None = None,
-    mlflow: str | os.PathLike[str] | None = None,
 ) -> ReportResult:
     """Write the page of a sweep and, in a folder beside it, each table as CSV and each figure as PNG and SVG.
 
@@ -277,19 +249,18 @@ def write_sweep_report(
         folder: the results folder of a sweep, which may still be running.
         page: the .html file (default: ``report.html`` in the folder); an older report there is replaced.
         title: heading of the page.
-        mlflow: a folder or a tracking URI to which the trials are also logged, see `export_trials`.
 
     Raises:
         BadInput: where there is no sweep; ConfigError: where the page or its files would replace something else.
-        MissingExtraError: when polars, jinja2, matplotlib or MLflow is not installed.
+        MissingExtraError: when polars, jinja2 or matplotlib is not installed.
     """
     writing = writing_around(Path(folder))
     sweep = read_sweep(folder)
-    target = check_page_path(Path(page) if page is not None else sweep.folder / PAGE)
+    target = check_page_path(Path(page) if page is not None else sweep.out / PAGE)
     beside = target.parent / (FILES if target.name == PAGE else f"{target.stem}-files")
     before = earlier_files(beside)
     sections = list(sections_of(sweep))
-    drawings = [d for section in sections for d in (*section.drawings, *section.more_drawings)]
+    drawings = [d for section in sections for d in section.drawings]
     for d in drawings:
         # Compute the layout once for PNG and SVG.
         d.figure.draw_without_rendering()
@@ -300,16 +271,11 @@ def write_sweep_report(
     with writing():
         write_files(beside, files, before)
         write_page(target, page_text)
-    logged = None
-    if mlflow is not None:
-        from plushsense.experiments.sweep.mlflow import export_trials
-
-        logged = export_trials(sweep, mlflow)
-    return ReportResult(target, beside, len(files), sweep.total, len(sweep.done), logged)
+    return ReportResult(target, beside, len(files), sweep.total, len(sweep.done))
 
 
 def render(
-    sweep: StoredSweep,
+    sweep: SweepResult,
     sections: Sequence[Section],
     pictures: Mapping[str, bytes],
     *,
@@ -324,14 +290,14 @@ def render(
         leaky=sweep.leaky,
         done=len(sweep.done),
         total=sweep.total,
-        over=wording.describe_runs(sweep.trials),
+        over=wording.describe_runs(sweep.rows),
         about=about_rows(sweep),
         sections=[_template_values(sweep, section, pictures) for section in sections],
         files=files,
     )
 
 
-def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
+def about_rows(sweep: SweepResult) -> list[tuple[str, str]]:
     """Return grid, data and split as (name, value) pairs."""
     head = sweep.head
     how, who = wording.describe_split(str(head.get("split")))
@@ -342,7 +308,7 @@ def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
     )
     waiting = sweep.total - len(sweep.done)
     seconds = head.get("seconds")
-    tested = {(r.get("seed"), r.get("fold")): int(r["test_windows"]) for r in sweep.runs if r.get("test_windows")}
+    tested = {(r.get("seed"), r.get("fold")): int(r["test_windows"]) for r in sweep.run_rows if r.get("test_windows")}
     scored = sum(tested.values()) // max(1, len({seed for seed, _ in tested}))
     return [
         ("Data set", text(head.get("dataset"))),
@@ -354,9 +320,9 @@ def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
         ("Context", wording.CONTEXT_WORDS.get(str(head.get("context")), text(head.get("context")))),
         ("Training preset", text(head.get("preset"))),
         *training_settings(sweep),
-        ("Padding", ", ".join(sorted({str(t.get("padding")) for t in sweep.trials})) or DASH),
+        ("Padding", ", ".join(sorted({str(t.get("padding")) for t in sweep.rows})) or DASH),
         ("Grid", f"{grid} (the paper's has {tables.PAPER_TRIALS} trials)"),
-        ("Seeds and folds", wording.describe_runs(sweep.trials)),
+        ("Seeds and folds", wording.describe_runs(sweep.rows)),
         (
             "Trials",
             f"{len(sweep.done)} of {sweep.total} done"
@@ -370,7 +336,7 @@ def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
     ]
 
 
-def training_settings(sweep: StoredSweep) -> list[tuple[str, str]]:
+def training_settings(sweep: SweepResult) -> list[tuple[str, str]]:
     """Return the settings of the networks and their training, with those of the preset filled in."""
     grid = sweep.head.get("grid") or {}
     preset = PRESETS.get(str(sweep.head.get("preset")))
@@ -391,7 +357,7 @@ def training_settings(sweep: StoredSweep) -> list[tuple[str, str]]:
     ]
 
 
-def _template_values(sweep: StoredSweep, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
+def _template_values(sweep: SweepResult, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
     return {
         "key": section.key,
         "title": section.title,
@@ -411,7 +377,7 @@ def _template_values(sweep: StoredSweep, section: Section, pictures: Mapping[str
 
 
 def _contents(
-    sweep: StoredSweep, sections: Sequence[Section], pictures: Mapping[str, bytes]
+    sweep: SweepResult, sections: Sequence[Section], pictures: Mapping[str, bytes]
 ) -> Iterator[tuple[str, bytes]]:
     """Yield the name and content of each file; every table includes the data and split of its scores."""
     source = {"dataset": sweep.head.get("dataset"), "split": sweep.head.get("split")}
@@ -419,6 +385,6 @@ def _contents(
     for section in sections:
         for table in (*section.tables, *section.files):
             yield f"{table.name}.csv", table.csv(source).encode()
-        for d in (*section.drawings, *section.more_drawings):
+        for d in section.drawings:
             yield f"{d.name}.png", png(d.figure, dpi=_DPI)
             yield f"{d.name}.svg", pictures[d.name]

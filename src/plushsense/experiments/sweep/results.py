@@ -7,13 +7,16 @@ import math
 import os
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import BadInput, need
-from plushsense.experiments.sweep.folder import CURVES, RUNS, SUMMARY, TRIALS, prediction_files
-from plushsense.reports.table import Row
+from plushsense.experiments.sweep.folder import BEST, CURVES, RUNS, SUMMARY, TRIALS, prediction_files
+from plushsense.experiments.sweep.trials import listed_columns
+from plushsense.reports.table import Row, Table
 
 _NEEDED = ("trial", "arch", "filters", "filter_set", "epochs", "batch_asked", "parameters", "accuracy", "macro_f1")
 
@@ -54,21 +57,35 @@ class SweepNetwork:
 
 
 @dataclass(frozen=True)
-class StoredSweep:
-    """The content of a sweep's results folder: ``head`` is sweep.json; the tables are rows."""
+class SweepResult:
+    """The results of a sweep, which may still be running, as its folder ``out`` has them.
 
-    folder: Path
+    ``head`` is the content of sweep.json; ``rows`` and ``run_rows`` are the rows of the tables of trials and of runs.
+    """
+
+    out: Path
     head: Row
-    trials: tuple[Row, ...]
-    runs: tuple[Row, ...] = ()
-    networks: tuple[SweepNetwork, ...] = field(init=False)
+    rows: tuple[Row, ...]
+    run_rows: tuple[Row, ...] = ()
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "networks", _networks(self.trials))
+    @cached_property
+    def networks(self) -> tuple[SweepNetwork, ...]:
+        """The networks, in the grid's order."""
+        return _networks(self.rows)
+
+    @property
+    def trials(self) -> Any:
+        """The table of trials, a polars frame with a row for each network, number of epochs and batch."""
+        return need("polars", "tables").read_parquet(self.out / TRIALS)
+
+    @property
+    def runs(self) -> Any:
+        """The table of runs, a polars frame with a row for each trial, seed and fold."""
+        return need("polars", "tables").read_parquet(self.out / RUNS)
 
     @property
     def name(self) -> str:
-        return str(self.head.get("name") or self.folder.name)
+        return str(self.head.get("name") or self.out.name)
 
     @property
     def leaky(self) -> bool:
@@ -81,26 +98,31 @@ class StoredSweep:
     @property
     def total(self) -> int:
         """Number of trials, without those that halving dropped."""
-        return len(self.trials) - self.dropped
+        return len(self.rows) - self.dropped
 
     @property
     def dropped(self) -> int:
         """Number of trials that halving did not train."""
-        return sum(trial.get("status") == "dropped" for trial in self.trials)
+        return sum(trial.get("status") == "dropped" for trial in self.rows)
+
+    @cached_property
+    def ranked(self) -> list[Row]:
+        """The complete trials, the most accurate first; of equal ones that of the smallest network."""
+        return sorted(self.done, key=lambda t: (-float(t["accuracy"]), int(t["parameters"])))
 
     @property
     def done(self) -> list[Row]:
         """The complete trials, which are ranked, drawn and averaged."""
-        return [t for t in self.trials if scored(t)]
+        return [t for t in self.rows if scored(t)]
 
     @property
     def archs(self) -> list[str]:
-        return list(dict.fromkeys(str(t["arch"]) for t in self.trials))
+        return list(dict.fromkeys(str(t["arch"]) for t in self.rows))
 
     @property
     def filter_sets(self) -> list[str]:
         """The filter sets, from the smallest to the largest."""
-        return sorted({str(t["filter_set"]) for t in self.trials}, key=lambda s: [int(n) for n in s.split("/")])
+        return sorted({str(t["filter_set"]) for t in self.rows}, key=lambda s: [int(n) for n in s.split("/")])
 
     @property
     def labels(self) -> list[str]:
@@ -120,42 +142,55 @@ class StoredSweep:
 
     def histories(self, trial: Row) -> list[list[Row]]:
         """Return the rows of epochs of each run of a trial, only up to its own number of epochs."""
-        jobs = sorted({r["run"] for r in self.runs if r["trial"] == trial["trial"]})
-        path = self.folder / CURVES
+        jobs = {r["run"] for r in self.run_rows if r["trial"] == trial["trial"]}
+        path = self.out / CURVES
         if not jobs or not path.exists():
             return []
         polars = need("polars", "tables")
         try:
             # A whole grid has half a million rows, so read only those of the trial.
             mine = polars.scan_parquet(path).filter(
-                polars.col("run").is_in(jobs) & (polars.col("epoch") <= trial["epochs"])
+                polars.col("run").is_in(sorted(jobs)) & (polars.col("epoch") <= trial["epochs"])
             )
-            rows = mine.sort("epoch").collect().to_dicts()
+            parts = mine.sort("epoch").collect().partition_by("run", "seed", "fold", maintain_order=True)
         except (OSError, polars.exceptions.PolarsError) as cause:
             raise _unread(path, cause) from None
-        by_run: dict[tuple[Any, ...], list[Row]] = {}
-        for row in rows:
-            by_run.setdefault((row["run"], row.get("seed"), row.get("fold")), []).append(row)
-        return list(by_run.values())
+        return [part.to_dicts() for part in parts]
 
     def best_of(self, arch: str, filters: str) -> Row | None:
         """Return the trial of a network with the highest accuracy; None if it has no score."""
-        mine = [t for t in self.done if (t["arch"], t["filters"]) == (arch, filters)]
-        return max(mine, key=lambda t: float(t["accuracy"])) if mine else None
+        return next((t for t in self.ranked if (t["arch"], t["filters"]) == (arch, filters)), None)
 
     @property
     def kept(self) -> list[Row]:
         """The trials whose predictions were kept, the most accurate first."""
         files = prediction_files(self.head)
-        return sorted((t for t in self.done if t["trial"] in files), key=lambda t: -float(t["accuracy"]))
+        return [t for t in self.ranked if t["trial"] in files]
 
     @property
     def best(self) -> Row | None:
-        """The trial with the highest test accuracy; of equal ones that of the smallest network."""
-        return max(self.done, key=lambda t: (float(t["accuracy"]), -int(t["parameters"])), default=None)
+        """The trial with the highest test accuracy."""
+        return self.ranked[0] if self.ranked else None
+
+    def best_table(self, *, terminal: bool = False) -> Table:
+        """Return the table of the `BEST` trials, which the page, the command line and notebooks show."""
+        rows = tuple(self.ranked[:BEST])
+        columns = tuple(c for c in listed_columns(terminal=terminal) if any(t.get(c.key) is not None for t in rows))
+        note = "Ranked on the test part itself, as the paper did: the first of many is flattered by luck."
+        marks = {"leaky": self.leaky, "simulated": self.simulated}
+        return Table("best-trials", "The best trials", columns, rows, (note,), **marks)
+
+    def __repr__(self) -> str:
+        marks = ", leaky" * self.leaky + ", SIMULATION" * self.simulated
+        text = f"{len(self.done)} of {self.total} trials of '{self.name}', {self.head.get('split')}{marks}"
+        first = f"; best {self.best['arch']} {self.best['filters']}: {self.best['accuracy']:.3f}" if self.best else ""
+        return f"SweepResult({text}{first}; {self.out})"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>{self.best_table(terminal=True).html()}"
 
 
-def read_sweep(folder: str | os.PathLike[str]) -> StoredSweep:
+def read_sweep(folder: str | os.PathLike[str]) -> SweepResult:
     """Read the results folder of a sweep.
 
     Raises:
@@ -176,7 +211,7 @@ def read_sweep(folder: str | os.PathLike[str]) -> StoredSweep:
     if not isinstance(head, dict):
         raise BadInput(f"'{place / SUMMARY}' is not a sweep (no object): run the sweep again to rebuild it.")
     trials = _table(place / TRIALS, needed=_NEEDED)
-    return StoredSweep(place, head, trials, _table(place / RUNS, missing=True))
+    return SweepResult(place, head, trials, _table(place / RUNS, missing=True))
 
 
 def _table(path: Path, needed: Sequence[str] = (), *, missing: bool = False) -> tuple[Row, ...]:

@@ -12,7 +12,7 @@ import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,11 @@ from plushsense.core.errors import ForgottenError, python_warning
 from plushsense.core.sentences import Message
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.sweep.folder import SETTINGS, SUMMARY, SweepFolder, SweepResult
+from plushsense.experiments.sweep.folder import SETTINGS, SUMMARY, SweepFolder
 from plushsense.experiments.sweep.grid import GridSpec, load_grid
 from plushsense.experiments.sweep.halving import QUARTER, Halving, HalvingCosts, Rung, Scores, halve
 from plushsense.experiments.sweep.plan import GridProblems, Plan, Trial, plan
+from plushsense.experiments.sweep.results import SweepResult, read_sweep
 from plushsense.experiments.sweep.trainings import Task, TrainAndScore, processes
 from plushsense.experiments.sweep.trials import PAPER_CHOICE, SweepHead, networks_to_keep
 from plushsense.jobs.journal import JOURNAL, UNFINISHED, Result, job_id
@@ -49,50 +50,70 @@ class SweepProgress(JobProgress):
     networks: int = 0
 
 
-def sweep(
-    dataset: Dataset | str | os.PathLike[str],
-    grid: GridSpec | str | os.PathLike[str] = "paper",
-    *,
-    out: str | os.PathLike[str] | None = None,
-    overwrite: bool = False,
-    workers: int = 0,
-    cluster: str | None = None,
-    keep_predictions: str = PAPER_CHOICE,
-    progress: Callable[[SweepProgress], None] | None = None,
-    display: bool = False,
-    warn: Warn = python_warning,
-    **changes: Any,
-) -> SweepResult:
-    """Train and score the trials of a grid: all, or with ``halving=True`` those of the better networks.
+@dataclass(frozen=True)
+class SweepSpec:
+    """What to sweep, and where.
 
-    Finished trainings are kept in the data set's ``cache`` folder, so that a stopped or killed sweep can be continued.
-    The tables in ``out`` are updated during the run.
-
-    Args:
+    Attributes:
         grid: "paper", "scripts", "people", the path of a TOML file, or a `GridSpec`.
-        out: output folder; see `default_place` for the default.
+        changes: new values of the grid's keys, such as ``{"split": "by-subject:5", "max_parameters": 8000}``; see
+            `load_grid`. (The paper's "windows:holdout" is leaky.)
+        out: output folder (default: ``evaluations/sweep-<name>`` in the data set; of a changed grid, with its split and
+            a hash).
+        overwrite: replace the results of another sweep there.
         workers: number of trainings at a time; 0: as many as the processor cores allow.
         cluster: address of a Ray cluster that trains instead of this machine's processes.
         keep_predictions: the networks whose predictions and confusions are kept; see `networks_to_keep`.
+    """
+
+    grid: GridSpec | str | os.PathLike[str] = "paper"
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    out: str | os.PathLike[str] | None = None
+    overwrite: bool = False
+    workers: int = 0
+    cluster: str | None = None
+    keep_predictions: str = PAPER_CHOICE
+
+    def place(self, dataset: Dataset, grid: GridSpec) -> Path:
+        """Return the output folder of the sweep of ``grid``, which is the changed one."""
+        if self.out is not None:
+            return Path(self.out)
+        name = f"sweep-{grid.name}"
+        if load_grid(self.grid)[0] != grid:
+            name += f"-{re.sub('[^A-Za-z0-9-]+', '-', grid.split)}-{job_id(grid.to_json())[:8]}"
+        return dataset.path / "evaluations" / name
+
+
+def sweep(
+    dataset: Dataset | str | os.PathLike[str],
+    spec: SweepSpec | None = None,
+    *,
+    progress: Callable[[SweepProgress], None] | None = None,
+    display: bool = False,
+    warn: Warn = python_warning,
+) -> SweepResult:
+    """Train and score the trials of a grid: all, or with halving those of the better networks.
+
+    Finished trainings are kept in the data set's ``cache`` folder, so that a stopped or killed sweep can be continued.
+    The tables in the output folder are updated during the run.
+
+    Args:
         progress: called when a training reports an epoch or is done.
         display: show the trainings, the best score so far and the time left on standard error.
-        changes: new values of a grid's keys, such as ``split="by-subject:5"`` (the paper's "windows:holdout" is leaky),
-            ``epochs=(20,)``, ``architectures=…``, ``max_parameters=8000``, ``seeds=…``, ``threads=2``.
 
     Raises:
         ConfigError: with all problems of the grid at once, before anything is trained.
         TrainingError: with halving, when every training failed.
     """
-    dataset = as_dataset(dataset)
-    spec, wrong = load_grid(grid, changes)
-    planned = plan(dataset, spec, wrong, warn)
-    costs = halving_costs(planned, warn) if spec.halving else None
-    place = Path(out) if out is not None else default_place(dataset, grid, spec)
-    keep = networks_to_keep(planned, keep_predictions)
-    check_results(place, "A sweep", SUMMARY, planned.id, replace=overwrite)
-    head = SweepHead.of(dataset, planned)
-    folder = SweepFolder(planned, place, head, dataset.generation.writing, keep)
-    work = _Work(dataset, planned, folder, processes(workers, spec.threads), cluster, progress, display)
+    dataset, spec = as_dataset(dataset), spec or SweepSpec()
+    grid, wrong = load_grid(spec.grid, spec.changes)
+    planned = plan(dataset, grid, wrong, warn)
+    costs = halving_costs(planned, warn) if grid.halving else None
+    place = spec.place(dataset, grid)
+    keep = networks_to_keep(planned, spec.keep_predictions)
+    check_results(place, "A sweep", SUMMARY, planned.id, replace=spec.overwrite)
+    folder = SweepFolder(planned, place, SweepHead.of(dataset, planned), dataset.generation.writing, keep)
+    work = _Work(dataset, spec, folder, progress, display)
     try:
         if costs is None:
             work.train(planned.jobs)
@@ -103,17 +124,8 @@ def sweep(
         if len(folder.trained) > len(folder.resumed):
             folder.write()
         raise
-    return folder.write(work.results)
-
-
-def default_place(dataset: Dataset, grid: GridSpec | str | os.PathLike[str], spec: GridSpec) -> Path:
-    """Return ``evaluations/sweep-<name>`` in the data set; with the split and a hash appended for a changed grid."""
-    plain, _ = load_grid(grid)
-    name = f"sweep-{spec.name}"
-    if plain != spec:
-        split = re.sub(r"[^A-Za-z0-9-]+", "-", spec.split)
-        name += f"-{split}-{job_id(spec.to_json())[:8]}"
-    return dataset.path / "evaluations" / name
+    folder.write(work.results)
+    return read_sweep(place)
 
 
 def candidates(planned: Plan) -> list[tuple[Trial, ...]]:
@@ -146,16 +158,15 @@ class _Work:
     def __init__(
         self,
         dataset: Dataset,
-        planned: Plan,
+        spec: SweepSpec,
         folder: SweepFolder,
-        workers: int,
-        cluster: str | None,
         progress: Callable[[SweepProgress], None] | None,
         display: bool,
     ) -> None:
-        self._dataset, self._plan, self._folder = dataset, planned, folder
-        self._workers, self._cluster, self._progress, self._display = workers, cluster, progress, display
-        self._jobs = {job.id: job for job in planned.jobs}
+        self._dataset, self._plan, self._folder = dataset, folder.plan, folder
+        self._workers, self._cluster = processes(spec.workers, folder.plan.grid.threads), spec.cluster
+        self._progress, self._display = progress, display
+        self._jobs = {job.id: job for job in folder.plan.jobs}
         self._best: BestScore | None = None
         self.results: dict[str, Result] = {}
 
@@ -354,32 +365,30 @@ class SweepPreview:
 
 def preview(
     dataset: Dataset | str | os.PathLike[str],
-    grid: GridSpec | str | os.PathLike[str] = "paper",
+    spec: SweepSpec | None = None,
     *,
     measure: bool = False,
-    keep_predictions: str = PAPER_CHOICE,
     warn: Warn = python_warning,
-    **changes: Any,
 ) -> SweepPreview:
     """Return what `sweep` would train, its cost, and all problems of the grid, without training.
 
     With ``measure``, the time on this machine is estimated, too.
     """
-    dataset = as_dataset(dataset)
-    spec, wrong = load_grid(grid, changes)
+    dataset, spec = as_dataset(dataset), spec or SweepSpec()
+    grid, wrong = load_grid(spec.grid, spec.changes)
     try:
-        planned = plan(dataset, spec, wrong, warn)
+        planned = plan(dataset, grid, wrong, warn)
     except GridProblems as cause:
-        return SweepPreview(spec, cause.problems)
-    networks_to_keep(planned, keep_predictions)
-    costs = halving_costs(planned, warn) if spec.halving else None
+        return SweepPreview(grid, cause.problems)
+    networks_to_keep(planned, spec.keep_predictions)
+    costs = halving_costs(planned, warn) if grid.halving else None
     journal = journal_of(dataset, JOURNAL)
     left = [job for job in planned.jobs if not journal.has(job.id)]
     seconds = None
     if measure:
         seconds = _seconds(planned, sum(map(planned.macs, left)) if costs is None else costs.bound)
     held = len(planned.jobs) - len(left)
-    return SweepPreview(spec, (), dataset.head.simulated, planned, held, seconds, costs)
+    return SweepPreview(grid, (), dataset.head.simulated, planned, held, seconds, costs)
 
 
 def _seconds(planned: Plan, macs: float) -> float:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from plushsense.experiments.sweep.folder import BEST
 from plushsense.experiments.sweep.results import (
-    StoredSweep,
     SweepNetwork,
+    SweepResult,
     file_name_of,
     finite,
     name_of,
     schedule,
     spread,
 )
-from plushsense.experiments.sweep.trials import listed_columns
 from plushsense.models.arch import PAPER_FILTERS, TABLE3, TABLE3_MISPRINT, Arch, slashed
 from plushsense.reports.table import Column, Row, Table, count
 from plushsense.scoring.metrics import accuracy_complexity_ratio, column_metrics, pareto_front
@@ -49,7 +48,7 @@ class Table4Row:
     """A row of Table 4 as printed: highest and mean accuracy over nine schedules, and ACR, as shares of 1."""
 
     parameters: str
-    highest: float
+    accuracy: float
     mean: float
     acr: float
 
@@ -127,7 +126,7 @@ class ArchitectureScores:
     parameters: int
 
 
-def architectures(sweep: StoredSweep, filter_set: str | None = None) -> list[ArchitectureScores]:
+def architectures(sweep: SweepResult, filter_set: str | None = None) -> list[ArchitectureScores]:
     """Return the accuracy of each architecture, over one or all filter sets."""
     rows = []
     for label in dict.fromkeys(n.label for n in sweep.networks):
@@ -142,7 +141,7 @@ def architectures(sweep: StoredSweep, filter_set: str | None = None) -> list[Arc
     return rows
 
 
-def architecture_table(sweep: StoredSweep) -> Table:
+def architecture_table(sweep: SweepResult) -> Table:
     """Return the numbers of Figures 7 and 8."""
     parts: list[str | None] = [None, *(sweep.filter_sets if len(sweep.filter_sets) > 1 else [])]
     columns = (
@@ -160,58 +159,44 @@ def architecture_table(sweep: StoredSweep) -> Table:
     return Table(name, "Each architecture over all its trials", columns, rows, (), limit)
 
 
-def batches(sweep: StoredSweep) -> list[str]:
+def batches(sweep: SweepResult) -> list[str]:
     """Return the batches as given in the grid, small to large, "full" last."""
-    asked = {str(t["batch_asked"]) for t in sweep.trials}
+    asked = {str(t["batch_asked"]) for t in sweep.rows}
     return sorted(asked, key=lambda b: (not b.isdecimal(), int(b) if b.isdecimal() else 0))
 
 
-def epochs(sweep: StoredSweep) -> list[int]:
-    return sorted({int(t["epochs"]) for t in sweep.trials})
+def epochs(sweep: SweepResult) -> list[int]:
+    return sorted({int(t["epochs"]) for t in sweep.rows})
 
 
-def compared(sweep: StoredSweep) -> tuple[list[SweepNetwork], bool]:
+def compared(sweep: SweepResult) -> tuple[list[SweepNetwork], bool]:
     """Return the networks with a score for every schedule and True, or if there are none, those with any and False."""
-    every = {(int(t["epochs"]), str(t["batch_asked"])) for t in sweep.trials}
+    every = {(int(t["epochs"]), str(t["batch_asked"])) for t in sweep.rows}
     whole = [n for n in sweep.networks if {(int(t["epochs"]), str(t["batch_asked"])) for t in n.done} == every]
     return (whole, True) if whole else ([n for n in sweep.networks if n.done], False)
 
 
-def effect(sweep: StoredSweep) -> Table:
+def effect(sweep: SweepResult) -> Table:
     """Return mean and standard deviation over the networks for each number of epochs and batch."""
     networks, whole = compared(sweep)
-    rows = []
-    for e in epochs(sweep):
-        for b in batches(sweep):
-            mine = [t for n in networks for t in n.done if (t["epochs"], str(t["batch_asked"])) == (e, b)]
-            scores = [float(t["accuracy"]) for t in mine]
-            keys = [key for key in column_metrics() if key != "accuracy"]
-            others = {key: [float(t[key]) for t in mine if finite(t.get(key))] for key in keys}
-            if scores:
-                rows.append(
-                    {
-                        "epochs": e,
-                        "batch_asked": b,
-                        "networks": len(scores),
-                        "accuracy": statistics.fmean(scores),
-                        "accuracy_sd": spread(scores),
-                        "highest": max(scores),
-                        **{key: statistics.fmean(values) if values else None for key, values in others.items()},
-                        **{f"{key}_sd": spread(values) for key, values in others.items()},
-                    }
-                )
+    rows, metrics = [], column_metrics()
+    for e, b in itertools.product(epochs(sweep), batches(sweep)):
+        mine = [t for n in networks for t in n.done if (t["epochs"], str(t["batch_asked"])) == (e, b)]
+        if mine:
+            row = {"epochs": e, "batch_asked": b, "networks": len(mine)}
+            for key in metrics:
+                values = [float(t[key]) for t in mine if finite(t.get(key))]
+                row |= {key: statistics.fmean(values) if values else None, f"{key}_sd": spread(values)}
+            rows.append({**row, "highest": max(float(t["accuracy"]) for t in mine)})
     columns = (
         Column("epochs", "Epochs", "count"),
         Column("batch_asked", "Batch"),
         Column("networks", "Networks", "count"),
-        Column("accuracy", "Mean accuracy", "percent", score=True),
-        Column("accuracy_sd", "sd over networks", "percent", score=True),
-        Column("highest", "Highest", "percent", score=True),
+        Column("highest", "Highest accuracy", "percent", score=True),
         *(
             Column(f"{key}{part}", head, "percent" if m.percent else "share", score=True)
-            for key, m in column_metrics().items()
-            if key != "accuracy"
-            for part, head in (("", f"Mean {m.name}"), ("_sd", "sd"))
+            for key, m in metrics.items()
+            for part, head in (("", f"Mean {m.name}"), ("_sd", "sd over networks"))
         ),
     )
     note = (
@@ -219,13 +204,8 @@ def effect(sweep: StoredSweep) -> Table:
         if whole
         else "No network has every schedule scored yet: each row is over others, and they are not to be compared."
     )
-    return Table(
-        "effect",
-        "Effect of epochs and batch",
-        columns,
-        tuple(rows),
-        (note, "The spread is over networks, not over seeds.") if rows else (),
-    )
+    notes = (note, "The spread is over networks, not over seeds.") if rows else ()
+    return Table("effect", "Effect of epochs and batch", columns, tuple(rows), notes)
 
 
 @dataclass(frozen=True)
@@ -242,7 +222,7 @@ class ParetoPoint:
     front: bool
 
 
-def pareto_points(sweep: StoredSweep, cost: str) -> list[ParetoPoint]:
+def pareto_points(sweep: SweepResult, cost: str) -> list[ParetoPoint]:
     """Return the networks that have a score, by ascending cost (a key of `COSTS`)."""
     best = [(n, t) for n in sweep.networks if (t := n.best("macro_f1")) and finite(t.get(cost)) and t[cost] > 0]
     front = pareto_front([(float(t["macro_f1"]), t[cost]) for _, t in best])
@@ -255,7 +235,7 @@ def pareto_points(sweep: StoredSweep, cost: str) -> list[ParetoPoint]:
     return sorted(points, key=lambda point: (point.value, -point.macro_f1))
 
 
-def pareto(sweep: StoredSweep) -> Table:
+def pareto(sweep: SweepResult) -> Table:
     """Return the networks on the Pareto fronts of macro-F1 and each of `COSTS`."""
     rows = [{**asdict(p), "cost": name} for cost, name in COSTS.items() for p in pareto_points(sweep, cost) if p.front]
     columns = (
@@ -278,15 +258,7 @@ TOP = 3
 """Number of networks of each size class (a filter set) in Table 4, as in the paper."""
 
 
-def best_trials(sweep: StoredSweep) -> Table:
-    """Return the `BEST` trials by accuracy, the highest first; of equal ones the smallest network first."""
-    ranked = sorted(sweep.done, key=lambda t: (-float(t["accuracy"]), int(t["parameters"])))[:BEST]
-    columns = tuple(c for c in listed_columns() if any(t.get(c.key) is not None for t in ranked))
-    notes = ["Ranked on the test part itself, as the paper did: the first of many is flattered by luck."]
-    return Table("best-trials", "The best trials", columns, tuple(ranked), tuple(notes))
-
-
-def table3(sweep: StoredSweep) -> Table:
+def table3(sweep: SweepResult) -> Table:
     """Return the numbers of parameters by architecture and filter set, beside those of the paper's Table 3."""
     rows: dict[str, dict[str, Any]] = {}
     met, near, off, other = 0, 0, list[str](), False
@@ -342,7 +314,7 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
     return words
 
 
-def table4(sweep: StoredSweep) -> Table:
+def table4(sweep: SweepResult) -> Table:
     """Return the best networks of each size class and all that the paper prints in Table 4, beside its figures."""
     rows = []
     for filter_set in sweep.filter_sets:
@@ -426,15 +398,12 @@ def _table4_row(network: SweepNetwork, rank: int) -> dict[str, Any]:
         **{key: best.get(key) for key in column_metrics() if key != "accuracy"},
         "validated_accuracy": validated["accuracy"] if validated else None,
         "above": "yes" if float(best["accuracy"]) > PAPER_THRESHOLD else "no",
-        "paper_parameters": printed.parameters if printed else None,
-        "paper_accuracy": printed.highest if printed else None,
-        "paper_mean": printed.mean if printed else None,
-        "paper_acr": printed.acr if printed else None,
+        **{f"paper_{name}": getattr(printed, name, None) for name in ("parameters", "accuracy", "mean", "acr")},
         "paper_split": AUTHORS_SPLIT if printed else None,
     }
 
 
-def confusion_table(sweep: StoredSweep, trial: Row, name: str) -> Table:
+def confusion_table(sweep: SweepResult, trial: Row, name: str) -> Table:
     """Return the confusion matrix of a trial, which must be stored: a row for each true class, in windows."""
     columns = (Column("truth", "Truth"), *(Column(f"read as {label}", label, "count") for label in sweep.labels))
     rows = tuple(
@@ -444,7 +413,7 @@ def confusion_table(sweep: StoredSweep, trial: Row, name: str) -> Table:
     return Table(name, f"Confusions of {name_of(trial)}", columns, rows)
 
 
-def per_class(sweep: StoredSweep, trial: Row) -> Table | None:
+def per_class(sweep: SweepResult, trial: Row) -> Table | None:
     """Return recall, precision and F1 of each gesture in one trial; None if they were not stored."""
     stored = (sweep.head.get("per_class") or {}).get(trial["trial"])
     if not isinstance(stored, Sequence) or not all(isinstance(row, Mapping) for row in stored) or not stored:

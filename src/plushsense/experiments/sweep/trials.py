@@ -1,13 +1,13 @@
 """The results of trials: their columns in tables, and the choice of those whose predictions are kept.
 
 Each column of the table of trials is an entry of the registry `TRIAL_COLUMNS`, from which Parquet, CSV, ``sweep.json``,
-the page, the command line, notebooks and MLflow are made.
+the page, the command line and notebooks are made.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from statistics import fmean, stdev
 from typing import Any, Literal, Self
@@ -115,19 +115,13 @@ class TrialResult:
         return stdev(values) if len(values) == len(self.scored) > 1 else None
 
     @property
-    def ranked(self) -> bool:
+    def complete(self) -> bool:
         """Whether the trial takes part in rankings: every one of its trainings is finished and has an accuracy."""
         return self.status == "done" and self.mean("accuracy") is not None
 
-    @property
-    def rank(self) -> tuple[float, int]:
-        """Sort key: the most accurate trial first, of equal ones the smallest network."""
-        return -(self.mean("accuracy") or 0.0), self.trial.arch.parameters
-
-    @property
-    def validation_rank(self) -> tuple[float, int]:
-        """Sort key by validation only: the best trial first, of equal ones the smallest network."""
-        return -(self.mean("validation_macro_f1") or 0.0), self.trial.arch.parameters
+    def rank(self, measure: str = "accuracy") -> tuple[float, int]:
+        """Return a sort key: the highest value first, of equal ones the smallest network."""
+        return -(self.mean(measure) or 0.0), self.trial.arch.parameters
 
     @property
     def counts(self) -> Counts:
@@ -138,6 +132,17 @@ class TrialResult:
     def row(self) -> dict[str, Any]:
         """Return the row in the table of trials, with every column; None where there is no value yet."""
         return {key: column.value(self) for key, column in TRIAL_COLUMNS.items()}
+
+
+def ranked(results: Iterable[TrialResult]) -> list[TrialResult]:
+    """Return the complete trials, the most accurate first."""
+    return sorted((result for result in results if result.complete), key=TrialResult.rank)
+
+
+def best_on_validation(results: Iterable[TrialResult]) -> TrialResult | None:
+    """Return the trial that validation alone chooses; of equal ones the smallest network, then the first."""
+    complete = (result for result in results if result.complete)
+    return min(complete, key=lambda result: result.rank("validation_macro_f1"), default=None)
 
 
 @dataclass(frozen=True)
