@@ -29,7 +29,7 @@ from plushsense.dataset.importing.sources import (
     source_files,
     split_regular_files,
 )
-from plushsense.dataset.importing.truncation import find_truncation
+from plushsense.dataset.importing.truncation import BACKUP, CHOICES, CHOSEN, ORIGINAL, Choice, read_choices
 from plushsense.dataset.importing.xdf import convert_xdf, is_xdf
 from plushsense.dataset.store import RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo
 from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
@@ -47,14 +47,16 @@ def scan_folder(source: Path, spec: ScanSpec, *, around: Path | None = None) -> 
     all_files = source_files(source)
     simulated = is_simulation(around or source, all_files)
     regular, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
-    script = find_truncation(source, regular)
-    refused += [SourceFile(f, LEFT_OUT, reason=why) for f, why in script.left_out.items()]
-    refused += [SourceFile(f, "", reason=why) for f, why in script.refused.items()]
-    sessions = read_sessions(script.files)
+    originals = [f for f in regular if any(map(BACKUP.fullmatch, f.relative_to(source).parts[:-1]))]
+    of_choices = [f for f in regular if f.name.casefold() == CHOICES and f not in originals]
+    refused += [SourceFile(f, LEFT_OUT, reason=ORIGINAL) for f in originals]
+    choices, choices_files = _read_choices(source, of_choices)
+    files = [f for f in regular if f not in {*originals, *of_choices}]
+    sessions = read_sessions(files)
     own = common_layout(sessions, spec.layout, spec.layout_origin)
-    in_session = [f for f in script.files if sessions and session_of(f, sessions) is not None]
-    rest = sorted(set(script.files) - set(in_session)) if in_session else script.files
-    scan = spec.begin_scan("sessions", [*script.files, *script.originals.values()], own)
+    in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
+    rest = sorted(set(files) - set(in_session))
+    scan = spec.begin_scan("sessions", files, own)
     plain = [f for f in rest if not is_xdf(f)]
     if spec.columns and len(plain) == len(rest):
         role = next(iter(spec.columns))
@@ -65,13 +67,12 @@ def scan_folder(source: Path, spec: ScanSpec, *, around: Path | None = None) -> 
     scan.shape = shape if rest else scan.shape
     mapping = None if spec.mapping is None else dict(spec.mapping)
     scan.found = [*refused, *classify_session_files(sessions, in_session)]
-    for file in classify_files(shape, source, plain, mapping, scan.gestures, spec.person):
-        original = script.originals.get(file.source) if file.kind == RECORDINGS else None
-        scan.found.append(file if original is None else replace(file, source=original, cut=file.source))
+    scan.found += classify_files(shape, source, plain, mapping, scan.gestures, spec.person)
     scan.found = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in scan.found]
     scan.people, of_people = people_of(sessions)
-    scan.notes += [*moved_note(scan.found), *of_people, *script.notes]
-    scan.choices = script.choices
+    scan.notes += [*moved_note(scan.found), *of_people]
+    scan.choices = choices
+    scan.add(choices_files)
     _scan_xdf_files(source, list(filter(is_xdf, rest)), spec, scan, around)
     if mapping is not None:
         present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
@@ -80,6 +81,25 @@ def scan_folder(source: Path, spec: ScanSpec, *, around: Path | None = None) -> 
             scan.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
     scan.simulated = simulated or any(not isinstance(head, str) and head.simulated for head in sessions.values())
     return scan
+
+
+def _read_choices(source: Path, files: Iterable[Path]) -> tuple[list[Choice], list[SourceFile | str]]:
+    """Read the choices of the truncation script in ``files`` of ``source``, or beside it, where the script writes them.
+
+    Returns:
+        The choices, and what became of each file; of one beside the source, a note if it cannot be read.
+    """
+    choices, about = list[Choice](), list[SourceFile | str]()
+    beside = source.resolve().parent / CHOICES
+    for path in [*files] or ([beside] if beside.is_file() else []):
+        name = None if path == beside else printable_path(path.relative_to(source))
+        try:
+            choices += read_choices(path)
+            about += [SourceFile(path, LEFT_OUT, origin=name, reason=CHOSEN)] if name else []
+        except DatasetError as cause:
+            note = Message("no trims are taken from the file beside the folder: {cause}", cause=cause, file=path.name)
+            about.append(SourceFile(path, "", origin=name, reason=cause.message) if name else note)
+    return choices, about
 
 
 def _scan_xdf_files(source: Path, files: list[Path], spec: ScanSpec, scan: SourceScan, around: Path | None) -> None:
@@ -407,7 +427,7 @@ def moved_note(files: Iterable[SourceFile]) -> list[Message]:
     moved = [f for f in files if f.gesture]
     if not moved:
         return []
-    first = f"'{(moved[0].cut or moved[0].source).name}' in '{moved[0].gesture}'"
+    first = f"'{moved[0].source.name}' in '{moved[0].gesture}'"
     return [
         Message(
             "{n:recording} in the folder of another gesture than the name says (the first: {file}): the folder's "
