@@ -7,7 +7,7 @@ name of the nearest folder is the person.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from plushsense.core.errors import BadInput, ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
-from plushsense.core.sentences import Message
+from plushsense.core.sentences import Message, join_names
 from plushsense.dataset.importing.sources import (
     COMPANIONS,
     LEFT_OUT,
@@ -65,20 +65,18 @@ def scan_folder(source: Path, spec: ScanSpec, *, around: Path | None = None) -> 
         )
     shape = "labelled-rows" if scan.layout.is_labelled else "gesture-recorder"
     scan.shape = shape if rest else scan.shape
-    mapping = None if spec.mapping is None else dict(spec.mapping)
     scan.found = [*refused, *classify_session_files(sessions, in_session)]
-    scan.found += classify_files(shape, source, plain, mapping, scan.gestures, spec.person)
+    scan.found += classify_files(shape, source, plain, spec, scan.gestures)
     scan.found = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in scan.found]
     scan.people, of_people = people_of(sessions)
     scan.notes += [*moved_note(scan.found), *of_people]
     scan.choices = choices
     scan.add(choices_files)
-    _scan_xdf_files(source, list(filter(is_xdf, rest)), spec, scan, around)
-    if mapping is not None:
-        present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
-        if missing := [name for name in mapping if name not in present]:
-            listed = ", ".join(f"'{m}'" for m in missing[:SHOWN]) + (", …" if len(missing) > SHOWN else "")
-            scan.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
+    _scan_xdf_files(source, list(filter(is_xdf, rest)), spec, scan)
+    present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
+    if missing := [name for name in spec.mapping or () if name not in present]:
+        listed = join_names(map(repr, missing), most=SHOWN)
+        scan.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
     scan.simulated = simulated or any(not isinstance(head, str) and head.simulated for head in sessions.values())
     return scan
 
@@ -102,18 +100,14 @@ def _read_choices(source: Path, files: Iterable[Path]) -> tuple[list[Choice], li
     return choices, about
 
 
-def _scan_xdf_files(source: Path, files: list[Path], spec: ScanSpec, scan: SourceScan, around: Path | None) -> None:
+def _scan_xdf_files(source: Path, files: list[Path], spec: ScanSpec, scan: SourceScan) -> None:
     """Convert the XDF files of a folder; add their recordings, and a note on sessions with several files."""
     files_of: dict[tuple[str, str], list[str]] = {}
     for file in files:
         name = printable_path(file.relative_to(source))
-        person = None if file.parent == around else file.parent.resolve().name
-        if file.parent == source and spec.person is not None:
-            person = spec.person or None
-        if spec.mapping is not None:
-            person = spec.mapped(file.relative_to(source))
         with scan.refusing(file, name):
-            files_of.setdefault(convert_xdf(file, name, person, spec, scan), []).append(name)
+            found = convert_xdf(file, name, _person_of(file, source, spec), spec, scan)
+            files_of.setdefault(found, []).append(name)
     for (subject, session), names in files_of.items():
         if len(names) > 1:
             scan.notes.append(
@@ -125,6 +119,15 @@ def _scan_xdf_files(source: Path, files: list[Path], spec: ScanSpec, scan: Sourc
                     files=names[:SHOWN],
                 )
             )
+
+
+def _person_of(path: Path, source: Path, spec: ScanSpec) -> str | None:
+    """Return the person of a file by the mapping, else by its folder; directly in ``source`` it is ``spec.person``."""
+    if spec.mapping is not None:
+        return spec.mapped(path.relative_to(source))
+    if path.parent == source and spec.person is not None:
+        return spec.person or None
+    return path.parent.resolve().name
 
 
 def _label_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> dict[Path, str]:
@@ -145,20 +148,18 @@ def _label_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> d
 
 def _same_gesture(one: str, other: str, gestures: GestureSet | None) -> bool:
     """Return whether two labels are of one gesture."""
-    if plain_label(one) == plain_label(other) or gestures is None:
-        return plain_label(one) == plain_label(other)
-    found = gestures.find(one)
-    return found is not None and found == gestures.find(other)
+    found = gestures.find(one) if gestures is not None else None
+    same = found is not None and gestures is not None and found == gestures.find(other)
+    return same or plain_label(one) == plain_label(other)
 
 
 def _nobodys_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> set[Path]:
     """Return the folders in which every recording is of a gesture without a person (the toy at rest)."""
-    with_nobody: set[Path] = set()
-    with_people: set[Path] = set()
+    by_nobody: dict[bool, set[Path]] = {True: set(), False: set()}
     for path, label in labels.items():
         gesture = gestures.find(label) if gestures is not None else None
-        (with_nobody if gesture is not None and gesture.nobody else with_people).add(path.parent)
-    return with_nobody - with_people
+        by_nobody[gesture is not None and gesture.nobody].add(path.parent)
+    return by_nobody[True] - by_nobody[False]
 
 
 def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested: bool) -> None:
@@ -168,8 +169,6 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
     """
     folders: dict[str, Path] = {}
     for f in files:
-        if not f.kind or f.subject in (NOBODY, UNKNOWN_SUBJECT):
-            continue
         other = folders.setdefault(f.subject.casefold(), f.source.parent)
         if other != f.source.parent:
             a, b = (p.relative_to(source).as_posix() for p in (other, f.source.parent))
@@ -182,8 +181,7 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
             )
     places = set(folders.values())
     for place in sorted(places) if nested else ():
-        above = next((p for p in place.parents if p in places), None)
-        if above is not None:
+        if above := next((p for p in place.parents if p in places), None):
             raise DatasetError(
                 "The person is not clear: '{a}' lies in '{b}', and both hold recordings: {ask}.",
                 a=place,
@@ -192,34 +190,20 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
             )
 
 
-def _where(subjects: dict[str, str] | None) -> str:
-    """Return where the person of a file is looked for."""
-    return "in the folder of a person" if subjects is None else "named in the mapping file of --subjects"
+def _without_person(path: Path, spec: ScanSpec) -> SourceFile:
+    """Return a file that is refused since its person is not known."""
+    where = "in the folder of a person" if spec.mapping is None else "named in the mapping file of --subjects"
+    return SourceFile(path, "", reason=Message("not {where}", where=where, needs="person"))
 
 
-def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
-    """Return the person that ``subjects`` has for the path of a file below ``source``, or for its name."""
-    return subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
-
-
-def _folder_person(path: Path, source: Path, person: str | None) -> str | None:
-    """Return the person whose folder holds a file; directly in ``source`` it is ``person``, unless that is None."""
-    return path.parent.resolve().name if path.parent != source or person is None else person or None
-
-
-def classify_gesture_recorder(
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
+def _classify_gesture_recorder(
+    source: Path, files: list[Path], spec: ScanSpec, gestures: GestureSet | None
 ) -> Iterator[SourceFile]:
     """Classify the files in the folders of the GestureRecorder.
 
-    ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
-    or nobody if all its recordings are of the toy at rest. A folder that is named like a gesture is no person: its
-    people are not known, and its label is that of all its recordings, as a label is corrected by moving the file.
-    ``person`` is as in `import_recordings`.
+    Without a mapping the nearest folder is the person, or nobody if all its recordings are of the toy at rest. A folder
+    that is named like a gesture is no person: its people are not known, and its label is that of all its recordings, as
+    a label is corrected by moving the file.
     """
     named = {path: name.label for path in files if (name := parse_name(path.name)) is not None}
     label_folders = _label_folders(named, gestures)
@@ -232,17 +216,14 @@ def classify_gesture_recorder(
         left_behind = {path.parent for path in files} - ({path.parent for path in named} - nobodys) | {source}
     for path in files:
         by_label = path.parent in label_folders or path.parent in left_behind
-        if subjects is not None:
+        subject = _person_of(path, source, spec)
+        if path.parent in nobodys:
             # A mapping need not list recordings of the untouched toy.
-            subject = _mapped(path, source, subjects) or (NOBODY if path.parent in nobodys else None)
-        elif path.parent in nobodys:
-            subject = NOBODY
-        elif by_label:
-            subject = person or UNKNOWN_SUBJECT
-        else:
-            subject = _folder_person(path, source, person)
+            subject = NOBODY if spec.mapping is None or subject is None else subject
+        elif by_label and spec.mapping is None:
+            subject = spec.person or UNKNOWN_SUBJECT
         if path.name.casefold() == STREAM_NAME.casefold():
-            if (by_label and not person) or subject is None:
+            if (by_label and not spec.person) or subject is None:
                 note = Message("a session stream whose person is not known", needs="person")
                 yield SourceFile(path, "", reason=note)
             else:
@@ -251,59 +232,43 @@ def classify_gesture_recorder(
             note = Message("not a recording: its name is not <label>_<epoch ms>_<rows>.csv")
             yield SourceFile(path, "", reason=note)
         elif subject is None:
-            yield SourceFile(path, "", reason=Message("not {where}", where=_where(subjects), needs="person"))
+            yield _without_person(path, spec)
         else:
             moved = not _same_gesture(named[path], labels[path], gestures)
             yield SourceFile(path, RECORDINGS, subject, gesture=labels[path] if moved else "")
 
 
-def classify_labelled_rows(
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
-) -> Iterator[SourceFile]:
+def _classify_labelled_rows(source: Path, files: list[Path], spec: ScanSpec) -> Iterator[SourceFile]:
     """Classify CSVs with a label on every row: each file is a stream, and runs of equal labels are recordings."""
-    one_person = all(path.parent == source for path in files)
+    one_person = spec.mapping is not None or all(path.parent == source for path in files)
     for path in files:
-        if subjects is not None:
-            subject = _mapped(path, source, subjects)
-        else:
-            subject = _folder_person(path, source, person) if one_person or path.parent != source else person or None
+        known = one_person or path.parent != source or spec.person
+        subject = _person_of(path, source, spec) if known else None
         if path.suffix.lower() != ".csv":
             yield SourceFile(path, "", reason=Message("not a CSV file"))
-        elif subject is None:
-            yield SourceFile(path, "", reason=Message("not {where}", where=_where(subjects), needs="person"))
         else:
-            yield SourceFile(path, STREAMS, subject)
-
-
-CLASSIFIERS: dict[str, Callable[..., Iterator[SourceFile]]] = {
-    "gesture-recorder": classify_gesture_recorder,
-    "labelled-rows": classify_labelled_rows,
-}
+            yield _without_person(path, spec) if subject is None else SourceFile(path, STREAMS, subject)
 
 
 def classify_files(
-    shape: str,
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
+    shape: str, source: Path, files: list[Path], spec: ScanSpec, gestures: GestureSet | None
 ) -> list[SourceFile]:
-    """Classify regular files by the folder structure ``shape`` (a key of `CLASSIFIERS`); each is returned once.
+    """Classify regular files of the folder structure ``shape``, labelled-rows or gesture-recorder; each once.
 
     Raises:
         DatasetError: if the folders do not identify the people.
     """
-    classified = list(CLASSIFIERS[shape](source, files, subjects, gestures, person))
-    if subjects is None:
+    by_rows = shape == "labelled-rows"
+    found = (
+        _classify_labelled_rows(source, files, spec)
+        if by_rows
+        else _classify_gesture_recorder(source, files, spec, gestures)
+    )
+    classified = list(found)
+    if spec.mapping is None:
         # A person that was named may have recordings in several folders of gestures.
-        _refuse_unclear_people(
-            source, [f for f in classified if f.subject != person], nested=shape == "gesture-recorder"
-        )
+        people = [f for f in classified if f.kind and f.subject not in (spec.person, NOBODY, UNKNOWN_SUBJECT)]
+        _refuse_unclear_people(source, people, nested=not by_rows)
     return classified
 
 

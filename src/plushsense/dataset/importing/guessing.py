@@ -9,6 +9,7 @@ import csv
 import json
 import math
 import re
+import tomllib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
 from plushsense.core.sentences import join_names
-from plushsense.core.toml import loads_json
+from plushsense.core.toml import load_table, loads_json
 from plushsense.dataset.importing.columns import (
     CODE_NAMES,
     MOST_CODES,
@@ -85,6 +86,11 @@ class GuessedPattern:
 
     toml: str
     doubts: list[str]
+
+    @property
+    def pattern(self) -> ImportPattern:
+        """The pattern itself, as `importers.preview_import` takes it."""
+        return load_table(tomllib.loads(self.toml), ImportPattern, "guessed pattern", ConfigError)
 
     def write(self, path: str | Path) -> None:
         """Write the TOML file; raise ConfigError if the file exists."""

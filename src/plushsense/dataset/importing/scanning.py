@@ -174,7 +174,7 @@ def scan_source(source: Path, spec: ScanSpec) -> SourceScan:
     except FileFormatError as cause:
         raise FileFormatError("'{source}': {cause}.", source=source, cause=cause.message) from None
     if spec.streams is not None:
-        find_people(scan, spec.streams)
+        find_people(scan, spec.streams, spec)
     if not any(f.kind in (RECORDINGS, STREAMS) for f in scan.found):
         raise _nothing_found(source, spec, scan)
     return scan

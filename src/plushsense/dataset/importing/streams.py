@@ -16,6 +16,7 @@ from plushsense.core.recorder_csv import STREAM_NAME, ReadResult, read_recording
 from plushsense.core.sentences import join_names, plural
 from plushsense.dataset.importing.folders import classify_files
 from plushsense.dataset.importing.sources import (
+    ScanSpec,
     SourceFile,
     SourceScan,
     is_simulation,
@@ -31,7 +32,7 @@ Stream = tuple[str, ReadResult, RowLookup]
 """Person, content and lookup of a stream."""
 
 
-def find_people(scan: SourceScan, folder: Path) -> None:
+def find_people(scan: SourceScan, folder: Path, spec: ScanSpec) -> None:
     """Give the recordings of ``scan`` whose people are not known the people in whose streams they are.
 
     The streams in ``folder`` are added to the scan, and notes on how many recordings were found.
@@ -47,7 +48,7 @@ def find_people(scan: SourceScan, folder: Path) -> None:
         raise DatasetError(f"There is no folder '{folder}': --streams names the folder of the people's folders.")
     files = source_files(folder)
     regular, _ = split_regular_files(f for f in files if f.name.casefold() == STREAM_NAME.casefold())
-    found = classify_files("gesture-recorder", folder, regular, None, None)
+    found = classify_files("gesture-recorder", folder, regular, replace(spec, person=None), None)
     if not found:
         raise DatasetError(f"'{folder}' has no {STREAM_NAME}: --streams names the folder of the people's folders.")
     unknown = [f for f in scan.found if f.kind == RECORDINGS and f.subject in (UNKNOWN_SUBJECT, NOBODY)]
