@@ -436,6 +436,7 @@ class TableImport:
             column=name,
             read_as=unit if suggests else "milliseconds",
             why=f", as the rate of {self.layout.rate_hz:g} Hz suggests" if suggests else "",
+            unit=unit,
         )
 
     def origins(self) -> Iterator[SourceFile]:
