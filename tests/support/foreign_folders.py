@@ -27,7 +27,8 @@ def touch_cells(src: Path) -> None:
         cells[:, :6] &= (np.arange(60)[:, None] > 20) & (np.arange(60)[:, None] < 45)
         # The nose and the belly are seldom touched.
         cells[:, 6:] &= take == 2
-        (folder / f"{label}_{take}.txt").write_text("".join("".join(map(str, row)) + "\n" for row in cells.astype(int)))
+        text = "".join(" ".join(map(str, row)) + "\n" for row in cells.astype(int))
+        (folder / f"{label}_{take}.txt").write_text(text)
     (src / "S01" / "readme.txt").write_text("eight cells\n")
 
 

@@ -264,7 +264,7 @@ def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
 def test_a_file_under_two_labels_and_a_long_window_are_named(
     dataset: Dataset, make_session: Callable[[Path, int], None], tmp_path: Path
 ) -> None:
-    from plushsense.dataset.importing.proposals import median_gesture_s
+    from plushsense.dataset.statistics import median_gesture_s
     from plushsense.models.arch import Arch
     from plushsense.windows.cut import WindowSpec
     from plushsense.workflow.preparation import warn_of_files_twice, warn_of_long_windows

@@ -5,7 +5,7 @@ Durations have the statistics of the authors' ``b_training_data_analysis.m``: me
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR
 from plushsense.dataset.store import PEOPLE, UNKNOWN_SUBJECT, Dataset, PersonInfo, RecordingInfo, read_people
+from plushsense.recording.takes import duration_s
 
 NOT_GIVEN = "not said"
 
@@ -202,3 +203,14 @@ def channel_table(dataset: Dataset) -> list[ChannelSummary]:
             if count[i]
         ]
     return out
+
+
+def median_gesture_s(dataset: Dataset, gestures: Iterable[str] | None = None) -> float | None:
+    """Return the median duration of the used recordings in seconds, of all or some gestures; None without any."""
+    chosen = None if gestures is None else set(gestures)
+    seconds = [
+        duration_s(r.stop - r.start, r.rate_hz or dataset.layout.rate_hz)
+        for r in dataset.used
+        if chosen is None or r.gesture in chosen
+    ]
+    return float(np.median(seconds)) if seconds else None

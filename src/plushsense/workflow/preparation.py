@@ -14,9 +14,9 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.layouts import Layout
 from plushsense.core.sentences import Message
-from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.quality.outliers import far_inputs
+from plushsense.dataset.statistics import median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.deploy.quantize import refuse_undeployable
 from plushsense.evaluation.crossval import fold_windows

@@ -78,25 +78,16 @@ def test_damaged_files(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    "content",
     [
-        (
-            b"  1.0000000e+00   2.5000000e+00\n  2.0000000e+00   3.5000000e+00\n",
-            "is text, as save -ascii writes it.*--pattern",
-        ),
-        (b"# Created by Octave 9.2\n# name: x\n# type: scalar\n1\n", "is text, .* save -v7 file  in Octave"),
-        (
-            b"MATLAB MAT-file, by a tool".ljust(124) + b"\x00\x02IM" + bytes(600),
-            r"has the format 7.3.*save\(file, '-v7'\)",
-        ),
-        (b"any text".ljust(124) + b"\x02\x00MI" + bytes(600), "has the format 7.3"),
-        (b"\x89HDF\r\n\x1a\n" + bytes(600), "has the format 7.3"),
-        (bytes(512) + b"\x89HDF\r\n\x1a\n" + bytes(600), "has the format 7.3"),
-        (struct.pack("<5i", 0, 2, 2, 0, 2) + b"x\0" + bytes(32), "has the format 4.*save -v7"),
-        (struct.pack(">5i", 1000, 2, 2, 0, 2) + b"x\0" + bytes(32), "has the format 4"),
+        b"  1.0000000e+00   2.5000000e+00\n  2.0000000e+00   3.5000000e+00\n",
+        b"MATLAB MAT-file, by a tool".ljust(124) + b"\x00\x02IM" + bytes(600),
+        bytes(512) + b"\x89HDF\r\n\x1a\n" + bytes(600),
+        struct.pack("<5i", 0, 2, 2, 0, 2) + b"x\0" + bytes(32),
     ],
+    ids=["text", "7.3", "HDF5", "4"],
 )
-def test_other_formats_of_matlab_are_named_with_a_way_out(path: Path, content: bytes, said: str) -> None:
+def test_other_formats_of_matlab_are_refused_with_a_way_out(path: Path, content: bytes) -> None:
     path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=said):
+    with pytest.raises(FileFormatError, match=r"another one such as 7.3, 4 or text: load it.*save -v7.*--pattern"):
         read_mat(path, "x.mat")

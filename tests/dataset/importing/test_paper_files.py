@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -81,92 +80,31 @@ def test_choices_before_the_truncation_are_marks(labelled: Path, tmp_path: Path)
             assert (name in chosen) == (r.id in states and states[r.id].how == BY_HAND)
 
 
-def test_the_uncut_originals_take_the_place_of_the_cut_recordings(labelled: Path, tmp_path: Path) -> None:
+def test_cut_recordings_and_their_backup(labelled: Path, tmp_path: Path) -> None:
     chosen = scripts.choose(labelled)
-    scripts.truncate(labelled, chosen)
-    for number, choices in enumerate((True, False)):
-        if not choices:
-            # What was cut off is known without the file of choices.
-            (labelled / CHOICES).unlink()
-        done = imported(labelled, tmp_path / f"DS{number}")
-        assert done.recordings == done.trimmed == done.added_recordings == RECORDINGS
-        replaced = [e for e in done.left_out if e.file.startswith(scripts.LABELLED)]
-        assert len(replaced) == RECORDINGS and all(e.reason.startswith("cut by the trunc") for e in replaced)
-        # Rows in names are those before the cut; one name is that of another recording.
-        assert ["its name states" in w for w in kinds(done)] == [False, True], kinds(done)
-        assert kinds(done)[0].endswith(f": {RECORDINGS} trim their recordings by a mark")
-        for r in done.dataset.recordings:
-            rows, cut = chosen.get(Path(r.file).name, (r.rows, 0))
-            assert (r.start, r.stop, r.rows) == (cut, rows, rows), r.id
+    backup = scripts.truncate(labelled, chosen)
+    done = imported(labelled, tmp_path / "CUT")
+    assert (done.recordings, done.trimmed) == (RECORDINGS, RECORDINGS - 1)
+    assert {r.start for r in done.dataset.recordings} == {0}, "the cut was made before"
+    assert any("were carried out before the import" in w for w in kinds(done))
+    originals = [e for e in done.left_out if e.file.startswith(scripts.BACKUP)]
+    assert len(originals) == RECORDINGS and all("import that folder alone" in e.reason for e in originals)
+    whole = imported(backup, tmp_path / "WHOLE")
+    assert (whole.recordings, whole.trimmed) == (RECORDINGS, RECORDINGS - 1)
+    assert sum(r.start for r in whole.dataset.recordings) == 40 * sum(n > 0 for _, n in chosen.values())
 
 
-def test_two_truncations_leave_one_original(labelled: Path, tmp_path: Path) -> None:
-    whole = {p.name: len(scripts._rows(p)) for p in (labelled / scripts.LABELLED).rglob("*.csv")}
-    scripts.truncate(labelled, scripts.choose(labelled))
-    later = scripts.BACKUP.replace("05-06", "06-01")
-    scripts.truncate(labelled, scripts.choose(labelled, cut=10), backup=later)
-    done = imported(labelled, tmp_path / "DS")
-    assert {Path(r.file).name: r.rows for r in done.dataset.recordings} == whole
-    assert {r.start for r in done.dataset.recordings} == {0, 50}
-    copies = [e.reason for e in done.left_out if e.file.startswith(later)]
-    assert set(copies) == {f"a copy, in '{later}', of a recording that is imported"} and len(copies) == RECORDINGS
-
-
-def test_a_recording_that_the_truncation_skipped_is_not_lost(labelled: Path, tmp_path: Path) -> None:
-    """Where nothing would remain, the script neither copies nor cuts."""
+def test_a_choice_that_would_leave_nothing_is_no_trim(labelled: Path, tmp_path: Path) -> None:
     chosen = scripts.choose(labelled)
     name = next(iter(chosen))
-    lines = (labelled / CHOICES).read_text().splitlines()
-    (line,) = (k for k, text in enumerate(lines) if text.startswith(f"{name},"))
-    lines[line] = lines[line].rpartition(",")[0] + f",{chosen[name][0]}"
-    (labelled / CHOICES).write_text("\n".join(lines) + "\n")
-    backup = scripts.truncate(labelled, chosen)
-    skipped = next((labelled / scripts.LABELLED).rglob(name))
-    next(backup.rglob(name)).rename(skipped)
+    text = (labelled / CHOICES).read_text()
+    (line,) = (line for line in text.splitlines() if line.startswith(f"{name},"))
+    (labelled / CHOICES).write_text(text.replace(line, line.rpartition(",")[0] + f",{chosen[name][0]}"))
     done = imported(labelled, tmp_path / "DS")
-    assert done.recordings == RECORDINGS
     (found,) = (r for r in done.dataset.recordings if Path(r.file).name == name)
     assert (found.rows, found.start) == (chosen[name][0], 0)
     (note,) = (w for w in kinds(done) if "cuts of the truncation script" in w)
-    assert f"{RECORDINGS - 1} trim their recordings by a mark" in note and "left out" not in note
     assert "1 would leave nothing, so that recordings stay whole" in note
-    alone = imported(backup, tmp_path / "ALONE")
-    assert alone.recordings == RECORDINGS - 1
-    assert any("1 are of recordings that are not in the source" in w for w in kinds(alone))
-
-
-def test_a_backup_of_other_rows_is_a_copy(labelled: Path, tmp_path: Path) -> None:
-    scripts.truncate(labelled, scripts.choose(labelled))
-    changed = min((labelled / scripts.LABELLED).rglob("Tail tap 2*.csv"))
-    lines = changed.read_text().splitlines()
-    changed.write_text("\n".join(["1" + lines[0], *lines[1:]]) + "\n")
-    done = imported(labelled, tmp_path / "DS")
-    assert [e.file for e in done.left_out if "a copy, in" in e.reason] == [
-        f"{scripts.BACKUP}/Tail tap 2/{changed.name}"
-    ]
-    (found,) = (r for r in done.dataset.recordings if Path(r.file).name == changed.name)
-    assert found.rows == len(lines)
-
-
-def test_cut_recordings_of_a_data_set_are_not_added_again_as_originals(labelled: Path, tmp_path: Path) -> None:
-    scripts.truncate(labelled, scripts.choose(labelled))
-    assert imported(labelled / scripts.LABELLED, tmp_path / "DS").recordings == RECORDINGS
-    done = import_recordings(labelled, tmp_path / "DS", add_to=True)
-    assert (done.recordings, done.already_there) == (RECORDINGS, RECORDINGS)
-
-
-def test_the_backup_alone_brings_the_whole_recordings_and_the_choices(labelled: Path, tmp_path: Path) -> None:
-    chosen = scripts.choose(labelled)
-    backup = scripts.truncate(labelled, chosen)
-    later = scripts.truncate(labelled, chosen, backup=scripts.BACKUP.replace("05-06", "06-01"))
-    done = imported(backup, tmp_path / "DS")
-    assert (done.recordings, done.trimmed) == (RECORDINGS, RECORDINGS - 1)
-    assert sum(r.start for r in done.dataset.recordings) == 40 * sum(n > 0 for _, n in chosen.values())
-    # Without the cut recordings, the oldest backup is imported.
-    shutil.rmtree(labelled / scripts.LABELLED)
-    both = imported(labelled, tmp_path / "DS2")
-    assert both.recordings == RECORDINGS
-    assert {later.name in e.file for e in both.left_out if "a copy" in e.reason} == {True}
 
 
 def test_a_recording_moved_to_another_label_has_the_label_of_its_folder(labelled: Path, tmp_path: Path) -> None:

@@ -93,17 +93,6 @@ def test_missing_values_may_fill_a_row(tmp_path: Path) -> None:
     assert rows_of(done) == [91]
 
 
-def test_a_number_of_rows_is_one_recording(tmp_path: Path) -> None:
-    done = imported(tmp_path, [*block(118), "1", *block(119, 500)], recording_rows=119)
-    assert rows_of(done) == [118, 119], "a row that is left out counts"
-    assert done.dataset.read(done.dataset.recordings[1]).values[0].tolist() == [0, 500]
-    done = imported(tmp_path / "2", joined([block(100), block(120)], ""), recording_rows=50)
-    assert rows_of(done) == [50, 50, 50, 50, 20], "rows are counted from the beginning of a block"
-    assert any("1 of 5 recordings have fewer than 50 rows" in note for note in done.notes)
-    with pytest.raises(ConfigError, match="recording_rows is 1: accepted are 0 and 2 or more rows"):
-        ImportPattern(recording_rows=1)
-
-
 def test_a_guess_says_that_files_hold_blocks(tmp_path: Path) -> None:
     for n, label in enumerate(("Pat", "Hit", "Rub", "Hold")):
         for person in ("P1", "P2"):
@@ -115,15 +104,6 @@ def test_a_guess_says_that_files_hold_blocks(tmp_path: Path) -> None:
     found = tomllib.loads(guessed.toml)
     assert "missing" not in found, "names of columns are no missing values"
     assert import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**found)).recordings == 24
-
-
-def test_a_guess_asks_about_equal_numbers_of_rows(tmp_path: Path) -> None:
-    for n, label in enumerate(("Pat", "Hit", "Rub", "Hold")):
-        for person in ("P1", "P2"):
-            (tmp_path / "src" / person).mkdir(parents=True, exist_ok=True)
-            (tmp_path / "src" / person / f"{label}.csv").write_text("\n".join([HEAD, *block(40 * (n + 2)), ""]))
-    doubts = guess_pattern(tmp_path / "src").doubts
-    assert any("80, 120, 160, 200 rows, all of them multiples of 40" in doubt for doubt in doubts)
 
 
 @pytest.mark.parametrize("clock", [[f"{1.5e12:.5E}"] * 120, [f"{np.float32(1.7e9 + k / 100):.1f}" for k in range(120)]])

@@ -173,8 +173,6 @@ class ImportedFiles:
             return Message("cannot be read: {why}", why=cause.strerror or cause)
         content = hashlib.sha256(raw).hexdigest()
         existing = self._contents.get((file.kind, content))
-        if existing is None and self._contents and file.cut is not None:
-            existing = self._contents.get((file.kind, sha256_of(file.cut)))
         if existing is not None:
             self.already[file.source] = existing
             return ""
@@ -258,7 +256,7 @@ class ImportedFiles:
         assert accounted == len(self.scan.found), "every source file is imported, left out or rejected"
 
     def marks(
-        self, recordings: Iterable[RecordingInfo], gestures: GestureSet, states: Mapping[str, MarkState] | None = None
+        self, recordings: Sequence[RecordingInfo], gestures: GestureSet, states: Mapping[str, MarkState]
     ) -> tuple[list[Mark], list[Mark], list[str]]:
         """Return the trims of the truncation script, the labels of folders, and notes; decisions in ``states`` stay.
 
@@ -266,14 +264,13 @@ class ImportedFiles:
             recordings: recordings of the data set.
             gestures: the gesture set of the data set.
         """
-        recordings = list(recordings)
         sources = {file: path for path, file in self.places.items()}
         trims, notes = truncation_marks(self.scan.choices, recordings, sources, states)
         folders = {f.source: f.gesture for f in self.scan.found}
         labels = []
         for info in recordings:
             source = sources.get(info.file)
-            now = (states or {}).get(info.id, MarkState())
+            now = states.get(info.id, MarkState())
             if source is None or source not in folders or now.gesture_by not in ("", IMPORTER):
                 continue
             label = folders[source]
@@ -443,7 +440,7 @@ def create_dataset(
         listed, notes = _merge_people({}, scan.people, people, {r.subject for r in built.dataset.recordings})
         if listed:
             write_people(work, listed)
-        trims, labels, remarks = files.marks(built.dataset.recordings, gestures)
+        trims, labels, remarks = files.marks(built.dataset.recordings, gestures, {})
         marks = [Mark(i, "exclude", RECORDER, why) for i, why in files.discarded().items() if why]
         append_marks(work, marks + trims + labels)
         (work / HEAD).write_text(head.to_toml(), encoding="utf-8")

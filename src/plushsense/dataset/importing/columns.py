@@ -66,13 +66,6 @@ class SampledColumn:
         return numbers > 0.6 * (numbers + words) and len(self.words) <= 3
 
     @property
-    def is_bits(self) -> bool:
-        cells = {cell.strip() for cell in self.cells}
-        same = len({len(cell) for cell in cells}) == 1 and max(map(len, cells)) > 1
-        digits = same and all(re.fullmatch("[01]+", cell) for cell in cells)
-        return digits and any(cell[0] == "0" for cell in cells) and len(cells) > 1 and not self.of_recording
-
-    @property
     def is_date(self) -> bool:
         return len(self.words) > 3 and self.holds_dates
 

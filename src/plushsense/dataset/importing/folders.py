@@ -2,21 +2,28 @@
 
 Three folder structures are supported: sessions of PlushSense's recorder, folders of the GestureRecorder (by person, or
 by label after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a session, the
-name of the nearest folder is the person.
+name of the nearest folder is the person. `find_people` finds anonymised recordings in the streams of their sessions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from plushsense.core.errors import BadInput, ConfigError, DatasetError
+from plushsense.core.errors import BadInput, ConfigError, DatasetError, FileFormatError
 from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
-from plushsense.core.sentences import Message
+from plushsense.core.recorder_csv import (
+    SIMULATION_MARK,
+    STREAM_NAME,
+    ReadResult,
+    parse_name,
+    read_recording,
+    read_stream,
+)
+from plushsense.core.sentences import Message, join_names, plural
 from plushsense.dataset.importing.sources import (
     COMPANIONS,
     LEFT_OUT,
@@ -29,8 +36,9 @@ from plushsense.dataset.importing.sources import (
     source_files,
     split_regular_files,
 )
-from plushsense.dataset.importing.truncation import find_truncation
+from plushsense.dataset.importing.truncation import BACKUP, CHOICES, CHOSEN, ORIGINAL, Choice, read_choices
 from plushsense.dataset.importing.xdf import convert_xdf, is_xdf
+from plushsense.dataset.index import RowLookup, locate
 from plushsense.dataset.store import RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo
 from plushsense.recording.writer import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
 
@@ -47,14 +55,16 @@ def scan_folder(source: Path, spec: ScanSpec, *, around: Path | None = None) -> 
     all_files = source_files(source)
     simulated = is_simulation(around or source, all_files)
     regular, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
-    script = find_truncation(source, regular)
-    refused += [SourceFile(f, LEFT_OUT, reason=why) for f, why in script.left_out.items()]
-    refused += [SourceFile(f, "", reason=why) for f, why in script.refused.items()]
-    sessions = read_sessions(script.files)
+    originals = [f for f in regular if any(map(BACKUP.fullmatch, f.relative_to(source).parts[:-1]))]
+    of_choices = [f for f in regular if f.name.casefold() == CHOICES and f not in originals]
+    refused += [SourceFile(f, LEFT_OUT, reason=ORIGINAL) for f in originals]
+    choices, choices_files = _read_choices(source, of_choices)
+    files = [f for f in regular if f not in {*originals, *of_choices}]
+    sessions = read_sessions(files)
     own = common_layout(sessions, spec.layout, spec.layout_origin)
-    in_session = [f for f in script.files if sessions and session_of(f, sessions) is not None]
-    rest = sorted(set(script.files) - set(in_session)) if in_session else script.files
-    scan = spec.begin_scan("sessions", [*script.files, *script.originals.values()], own)
+    in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
+    rest = sorted(set(files) - set(in_session))
+    scan = spec.begin_scan("sessions", files, own)
     plain = [f for f in rest if not is_xdf(f)]
     if spec.columns and len(plain) == len(rest):
         role = next(iter(spec.columns))
@@ -63,37 +73,49 @@ def scan_folder(source: Path, spec: ScanSpec, *, around: Path | None = None) -> 
         )
     shape = "labelled-rows" if scan.layout.is_labelled else "gesture-recorder"
     scan.shape = shape if rest else scan.shape
-    mapping = None if spec.mapping is None else dict(spec.mapping)
     scan.found = [*refused, *classify_session_files(sessions, in_session)]
-    for file in classify_files(shape, source, plain, mapping, scan.gestures, spec.person):
-        original = script.originals.get(file.source) if file.kind == RECORDINGS else None
-        scan.found.append(file if original is None else replace(file, source=original, cut=file.source))
+    scan.found += classify_files(shape, source, plain, spec, scan.gestures)
     scan.found = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in scan.found]
     scan.people, of_people = people_of(sessions)
-    scan.notes += [*moved_note(scan.found), *of_people, *script.notes]
-    scan.choices = script.choices
-    _scan_xdf_files(source, list(filter(is_xdf, rest)), spec, scan, around)
-    if mapping is not None:
-        present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
-        if missing := [name for name in mapping if name not in present]:
-            listed = ", ".join(f"'{m}'" for m in missing[:SHOWN]) + (", …" if len(missing) > SHOWN else "")
-            scan.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
+    scan.notes += [*moved_note(scan.found), *of_people]
+    scan.choices = choices
+    scan.add(choices_files)
+    _scan_xdf_files(source, list(filter(is_xdf, rest)), spec, scan)
+    present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
+    if missing := [name for name in spec.mapping or () if name not in present]:
+        listed = join_names(map(repr, missing), most=SHOWN)
+        scan.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
     scan.simulated = simulated or any(not isinstance(head, str) and head.simulated for head in sessions.values())
     return scan
 
 
-def _scan_xdf_files(source: Path, files: list[Path], spec: ScanSpec, scan: SourceScan, around: Path | None) -> None:
+def _read_choices(source: Path, files: Iterable[Path]) -> tuple[list[Choice], list[SourceFile | str]]:
+    """Read the choices of the truncation script in ``files`` of ``source``, or beside it, where the script writes them.
+
+    Returns:
+        The choices, and what became of each file; of one beside the source, a note if it cannot be read.
+    """
+    choices, about = list[Choice](), list[SourceFile | str]()
+    beside = source.resolve().parent / CHOICES
+    for path in [*files] or ([beside] if beside.is_file() else []):
+        name = None if path == beside else printable_path(path.relative_to(source))
+        try:
+            choices += read_choices(path)
+            about += [SourceFile(path, LEFT_OUT, origin=name, reason=CHOSEN)] if name else []
+        except DatasetError as cause:
+            note = Message("no trims are taken from the file beside the folder: {cause}", cause=cause, file=path.name)
+            about.append(SourceFile(path, "", origin=name, reason=cause.message) if name else note)
+    return choices, about
+
+
+def _scan_xdf_files(source: Path, files: list[Path], spec: ScanSpec, scan: SourceScan) -> None:
     """Convert the XDF files of a folder; add their recordings, and a note on sessions with several files."""
     files_of: dict[tuple[str, str], list[str]] = {}
     for file in files:
         name = printable_path(file.relative_to(source))
-        person = None if file.parent == around else file.parent.resolve().name
-        if file.parent == source and spec.person is not None:
-            person = spec.person or None
-        if spec.mapping is not None:
-            person = spec.mapped(file.relative_to(source))
         with scan.refusing(file, name):
-            files_of.setdefault(convert_xdf(file, name, person, spec, scan), []).append(name)
+            found = convert_xdf(file, name, _person_of(file, source, spec), spec, scan)
+            files_of.setdefault(found, []).append(name)
     for (subject, session), names in files_of.items():
         if len(names) > 1:
             scan.notes.append(
@@ -105,6 +127,15 @@ def _scan_xdf_files(source: Path, files: list[Path], spec: ScanSpec, scan: Sourc
                     files=names[:SHOWN],
                 )
             )
+
+
+def _person_of(path: Path, source: Path, spec: ScanSpec) -> str | None:
+    """Return the person of a file by the mapping, else by its folder; directly in ``source`` it is ``spec.person``."""
+    if spec.mapping is not None:
+        return spec.mapped(path.relative_to(source))
+    if path.parent == source and spec.person is not None:
+        return spec.person or None
+    return path.parent.resolve().name
 
 
 def _label_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> dict[Path, str]:
@@ -125,20 +156,18 @@ def _label_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> d
 
 def _same_gesture(one: str, other: str, gestures: GestureSet | None) -> bool:
     """Return whether two labels are of one gesture."""
-    if plain_label(one) == plain_label(other) or gestures is None:
-        return plain_label(one) == plain_label(other)
-    found = gestures.find(one)
-    return found is not None and found == gestures.find(other)
+    found = gestures.find(one) if gestures is not None else None
+    same = found is not None and gestures is not None and found == gestures.find(other)
+    return same or plain_label(one) == plain_label(other)
 
 
 def _nobodys_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> set[Path]:
     """Return the folders in which every recording is of a gesture without a person (the toy at rest)."""
-    with_nobody: set[Path] = set()
-    with_people: set[Path] = set()
+    by_nobody: dict[bool, set[Path]] = {True: set(), False: set()}
     for path, label in labels.items():
         gesture = gestures.find(label) if gestures is not None else None
-        (with_nobody if gesture is not None and gesture.nobody else with_people).add(path.parent)
-    return with_nobody - with_people
+        by_nobody[gesture is not None and gesture.nobody].add(path.parent)
+    return by_nobody[True] - by_nobody[False]
 
 
 def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested: bool) -> None:
@@ -148,8 +177,6 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
     """
     folders: dict[str, Path] = {}
     for f in files:
-        if not f.kind or f.subject in (NOBODY, UNKNOWN_SUBJECT):
-            continue
         other = folders.setdefault(f.subject.casefold(), f.source.parent)
         if other != f.source.parent:
             a, b = (p.relative_to(source).as_posix() for p in (other, f.source.parent))
@@ -162,8 +189,7 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
             )
     places = set(folders.values())
     for place in sorted(places) if nested else ():
-        above = next((p for p in place.parents if p in places), None)
-        if above is not None:
+        if above := next((p for p in place.parents if p in places), None):
             raise DatasetError(
                 "The person is not clear: '{a}' lies in '{b}', and both hold recordings: {ask}.",
                 a=place,
@@ -172,34 +198,20 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
             )
 
 
-def _where(subjects: dict[str, str] | None) -> str:
-    """Return where the person of a file is looked for."""
-    return "in the folder of a person" if subjects is None else "named in the mapping file of --subjects"
+def _without_person(path: Path, spec: ScanSpec) -> SourceFile:
+    """Return a file that is refused since its person is not known."""
+    where = "in the folder of a person" if spec.mapping is None else "named in the mapping file of --subjects"
+    return SourceFile(path, "", reason=Message("not {where}", where=where, needs="person"))
 
 
-def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
-    """Return the person that ``subjects`` has for the path of a file below ``source``, or for its name."""
-    return subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
-
-
-def _folder_person(path: Path, source: Path, person: str | None) -> str | None:
-    """Return the person whose folder holds a file; directly in ``source`` it is ``person``, unless that is None."""
-    return path.parent.resolve().name if path.parent != source or person is None else person or None
-
-
-def classify_gesture_recorder(
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
+def _classify_gesture_recorder(
+    source: Path, files: list[Path], spec: ScanSpec, gestures: GestureSet | None
 ) -> Iterator[SourceFile]:
     """Classify the files in the folders of the GestureRecorder.
 
-    ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
-    or nobody if all its recordings are of the toy at rest. A folder that is named like a gesture is no person: its
-    people are not known, and its label is that of all its recordings, as a label is corrected by moving the file.
-    ``person`` is as in `import_recordings`.
+    Without a mapping the nearest folder is the person, or nobody if all its recordings are of the toy at rest. A folder
+    that is named like a gesture is no person: its people are not known, and its label is that of all its recordings, as
+    a label is corrected by moving the file.
     """
     named = {path: name.label for path in files if (name := parse_name(path.name)) is not None}
     label_folders = _label_folders(named, gestures)
@@ -212,17 +224,14 @@ def classify_gesture_recorder(
         left_behind = {path.parent for path in files} - ({path.parent for path in named} - nobodys) | {source}
     for path in files:
         by_label = path.parent in label_folders or path.parent in left_behind
-        if subjects is not None:
+        subject = _person_of(path, source, spec)
+        if path.parent in nobodys:
             # A mapping need not list recordings of the untouched toy.
-            subject = _mapped(path, source, subjects) or (NOBODY if path.parent in nobodys else None)
-        elif path.parent in nobodys:
-            subject = NOBODY
-        elif by_label:
-            subject = person or UNKNOWN_SUBJECT
-        else:
-            subject = _folder_person(path, source, person)
+            subject = NOBODY if spec.mapping is None or subject is None else subject
+        elif by_label and spec.mapping is None:
+            subject = spec.person or UNKNOWN_SUBJECT
         if path.name.casefold() == STREAM_NAME.casefold():
-            if (by_label and not person) or subject is None:
+            if (by_label and not spec.person) or subject is None:
                 note = Message("a session stream whose person is not known", needs="person")
                 yield SourceFile(path, "", reason=note)
             else:
@@ -231,59 +240,43 @@ def classify_gesture_recorder(
             note = Message("not a recording: its name is not <label>_<epoch ms>_<rows>.csv")
             yield SourceFile(path, "", reason=note)
         elif subject is None:
-            yield SourceFile(path, "", reason=Message("not {where}", where=_where(subjects), needs="person"))
+            yield _without_person(path, spec)
         else:
             moved = not _same_gesture(named[path], labels[path], gestures)
             yield SourceFile(path, RECORDINGS, subject, gesture=labels[path] if moved else "")
 
 
-def classify_labelled_rows(
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
-) -> Iterator[SourceFile]:
+def _classify_labelled_rows(source: Path, files: list[Path], spec: ScanSpec) -> Iterator[SourceFile]:
     """Classify CSVs with a label on every row: each file is a stream, and runs of equal labels are recordings."""
-    one_person = all(path.parent == source for path in files)
+    one_person = spec.mapping is not None or all(path.parent == source for path in files)
     for path in files:
-        if subjects is not None:
-            subject = _mapped(path, source, subjects)
-        else:
-            subject = _folder_person(path, source, person) if one_person or path.parent != source else person or None
+        known = one_person or path.parent != source or spec.person
+        subject = _person_of(path, source, spec) if known else None
         if path.suffix.lower() != ".csv":
             yield SourceFile(path, "", reason=Message("not a CSV file"))
-        elif subject is None:
-            yield SourceFile(path, "", reason=Message("not {where}", where=_where(subjects), needs="person"))
         else:
-            yield SourceFile(path, STREAMS, subject)
-
-
-CLASSIFIERS: dict[str, Callable[..., Iterator[SourceFile]]] = {
-    "gesture-recorder": classify_gesture_recorder,
-    "labelled-rows": classify_labelled_rows,
-}
+            yield _without_person(path, spec) if subject is None else SourceFile(path, STREAMS, subject)
 
 
 def classify_files(
-    shape: str,
-    source: Path,
-    files: list[Path],
-    subjects: dict[str, str] | None,
-    gestures: GestureSet | None,
-    person: str | None = None,
+    shape: str, source: Path, files: list[Path], spec: ScanSpec, gestures: GestureSet | None
 ) -> list[SourceFile]:
-    """Classify regular files by the folder structure ``shape`` (a key of `CLASSIFIERS`); each is returned once.
+    """Classify regular files of the folder structure ``shape``, labelled-rows or gesture-recorder; each once.
 
     Raises:
         DatasetError: if the folders do not identify the people.
     """
-    classified = list(CLASSIFIERS[shape](source, files, subjects, gestures, person))
-    if subjects is None:
+    by_rows = shape == "labelled-rows"
+    found = (
+        _classify_labelled_rows(source, files, spec)
+        if by_rows
+        else _classify_gesture_recorder(source, files, spec, gestures)
+    )
+    classified = list(found)
+    if spec.mapping is None:
         # A person that was named may have recordings in several folders of gestures.
-        _refuse_unclear_people(
-            source, [f for f in classified if f.subject != person], nested=shape == "gesture-recorder"
-        )
+        people = [f for f in classified if f.kind and f.subject not in (spec.person, NOBODY, UNKNOWN_SUBJECT)]
+        _refuse_unclear_people(source, people, nested=not by_rows)
     return classified
 
 
@@ -407,7 +400,7 @@ def moved_note(files: Iterable[SourceFile]) -> list[Message]:
     moved = [f for f in files if f.gesture]
     if not moved:
         return []
-    first = f"'{(moved[0].cut or moved[0].source).name}' in '{moved[0].gesture}'"
+    first = f"'{moved[0].source.name}' in '{moved[0].gesture}'"
     return [
         Message(
             "{n:recording} in the folder of another gesture than the name says (the first: {file}): the folder's "
@@ -447,3 +440,81 @@ def _plain(text: str) -> str:
     """Return ``text`` as one printable line."""
     text = text.encode("utf-8", "replace").decode("utf-8")
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+Stream = tuple[str, ReadResult, RowLookup]
+"""Person, content and lookup of a stream."""
+
+
+def find_people(scan: SourceScan, folder: Path, spec: ScanSpec) -> None:
+    """Give the recordings of ``scan`` whose people are not known the people in whose streams they are.
+
+    ``a_move_labelled_data.m`` moves the recordings of all people to folders of labels, under random names, and leaves
+    the stream of each person where it was; a recording is a part of it, with the same clocks. The streams in ``folder``
+    are added to the scan, and notes on how many recordings were found.
+
+    Args:
+        folder: folders of people, each with its ``fulldatastream.csv``.
+
+    Raises:
+        DatasetError: if ``folder`` has no stream, none of the recordings is in one, or ``scan`` has no recording
+            without a known person.
+    """
+    if not folder.is_dir():
+        raise DatasetError(f"There is no folder '{folder}': --streams names the folder of the people's folders.")
+    files = source_files(folder)
+    regular, _ = split_regular_files(f for f in files if f.name.casefold() == STREAM_NAME.casefold())
+    found = classify_files("gesture-recorder", folder, regular, replace(spec, person=None), None)
+    if not found:
+        raise DatasetError(f"'{folder}' has no {STREAM_NAME}: --streams names the folder of the people's folders.")
+    unknown = [f for f in scan.found if f.kind == RECORDINGS and f.subject in (UNKNOWN_SUBJECT, NOBODY)]
+    if not any(f.subject == UNKNOWN_SUBJECT for f in unknown):
+        raise DatasetError("--streams is for recordings whose people are not known; the source has none: leave it out.")
+    streams = [s for f in found if (s := _read(f, scan)) is not None]
+    people = {f.source: _people_of(f, streams, scan) for f in unknown}
+    named = {path: mine[0] for path, mine in people.items() if len(mine) == 1}
+    if not any(people.values()):
+        raise DatasetError(
+            f"None of {plural(len(people), 'recording')} is in a stream of '{folder}': give --streams the folder of "
+            "the people who made them, or leave it out."
+        )
+    theirs = {path.resolve() for path in regular}
+    scan.found = [
+        replace(f, subject=named.get(f.source, f.subject)) for f in scan.found if f.source.resolve() not in theirs
+    ]
+    scan.found += [replace(f, origin=printable_path(f.source.relative_to(folder))) for f in found]
+    scan.simulated = scan.simulated or is_simulation(folder, files)
+    scan.streams_named = True
+    note = f"{len(named)} of {len(people)} recordings are found in the streams of '{folder.name}'"
+    if named:
+        note += ", and have their people from there: this undoes the anonymisation of the recordings"
+    scan.notes.append(note)
+    lost = [f.origin for f in unknown if not people[f.source]]
+    if lost:
+        scan.notes.append(f"in none of the streams, so without a person ({len(lost)}): {join_names(lost, most=SHOWN)}")
+    several = [f"{f.origin} ({join_names(mine)})" for f in unknown if len(mine := people[f.source]) > 1]
+    if several:
+        listed = join_names(several, most=SHOWN)
+        scan.notes.append(f"in the streams of several people, so without a person ({len(several)}): {listed}")
+
+
+def _read(file: SourceFile, scan: SourceScan) -> Stream | None:
+    """Read a stream; None if it cannot be read, which the import says when it reads the copy."""
+    try:
+        read = read_stream(file.source, scan.layout)
+    except FileFormatError:
+        return None
+    return file.subject, read, RowLookup.of(read.frames)
+
+
+def _people_of(file: SourceFile, streams: Sequence[Stream], scan: SourceScan) -> list[str]:
+    """Return the people in whose streams most of a recording is; several if equally many of its rows are in each."""
+    try:
+        recording = read_recording(file.source, scan.layout)
+    except FileFormatError:
+        return []
+    rows: dict[str, int] = {}
+    for person, stream, lookup in streams:
+        rows[person] = max(rows.get(person, 0), locate(recording, stream, lookup)[1])
+    most = max(rows.values(), default=0)
+    return [person for person, n in rows.items() if n == most] if 2 * most > len(recording.frames) else []

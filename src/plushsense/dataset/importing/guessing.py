@@ -9,6 +9,7 @@ import csv
 import json
 import math
 import re
+import tomllib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
 from plushsense.core.sentences import join_names
-from plushsense.core.toml import loads_json
+from plushsense.core.toml import load_table, loads_json
 from plushsense.dataset.importing.columns import (
     CODE_NAMES,
     MOST_CODES,
@@ -63,7 +64,6 @@ _USUAL_HZ = 50.0
 # The first with which the rows have the same number of cells; a comma may also be in decimals.
 _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_STEPS = 1e7
-_LEAST_ROWS, _COUNTED = 20, 200
 _IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
 _LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
@@ -86,6 +86,11 @@ class GuessedPattern:
 
     toml: str
     doubts: list[str]
+
+    @property
+    def pattern(self) -> ImportPattern:
+        """The pattern itself, as `importers.preview_import` takes it."""
+        return load_table(tomllib.loads(self.toml), ImportPattern, "guessed pattern", ConfigError)
 
     def write(self, path: str | Path) -> None:
         """Write the TOML file; raise ConfigError if the file exists."""
@@ -114,7 +119,6 @@ class _PatternDraft:
     width: int = 1
     separator: str = ""
     form: TableForm | None = None
-    in_blocks: bool = False
     doubts: list[str] = field(default_factory=list)
 
 
@@ -164,8 +168,6 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     if parts.labels:
         guess.labels = parts.labels
     _codes(parts, guess)
-    if "row_rate_hz" in guess.keys and "label" not in guess.taken and not guess.is_json:
-        _equal_recordings(mine, guess)
     _idle(guess)
     _aliases(guess)
     # Names in the files may hold characters that no line of text can show.
@@ -348,7 +350,6 @@ def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft)
             "empty lines, comments or repeated column names separate blocks of rows: each block is taken for a "
             f'recording (up to {blocks} in the first lines of a file); if they are no recordings, add  between = "none"'
         )
-        guess.in_blocks = True
     if markers:
         line = markers.most_common(1)[0][0][:40]
         guess.doubts.append(
@@ -360,24 +361,6 @@ def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft)
 def _is_marker(row: Sequence[str]) -> bool:
     """Return whether a line has text in its first cell only."""
     return bool(row) and bool(row[0].strip()) and is_text(row) and not any(cell.strip() for cell in row[1:])
-
-
-def _equal_recordings(files: Sequence[Path], guess: _PatternDraft) -> None:
-    """Add a doubt if the numbers of rows of the files suggest recordings of equal length, one after the other."""
-    if guess.in_blocks:
-        return
-    counts, separator = set[int](), guess.separator.strip().encode() or None
-    for file in files[:_COUNTED]:
-        with file.open("rb") as opened:
-            cells = (line.split(separator, 1)[0].decode("latin-1") for line in opened if line.strip())
-            counts.add(sum(map(is_number, cells)))
-    common = math.gcd(*counts)
-    if common >= _LEAST_ROWS and len(counts) > 1:
-        listed = ", ".join(str(n) for n in sorted(counts)[:4]) + (", …" if len(counts) > 4 else "")
-        guess.doubts.append(
-            f"the files have {listed} rows, all of them multiples of {common}: if recordings of a fixed number of rows "
-            "follow one another, give it as recording_rows"
-        )
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:
@@ -425,12 +408,6 @@ def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
                 guess.columns[role] = column.key
         return column
 
-    if bits := [c for c in columns if c.is_bits]:
-        guess.keys["bits"] = [c.key for c in bits]
-        left = [c for c in left if c not in bits]
-        n = sum(len(c.cells[0].strip()) for c in bits)
-        guess.channels += [_channel(f"cell{k + 1}", "binary", valid_min=0, valid_max=1) for k in range(n)]
-        guess.doubts.append(f"{n} binary channels are named cell1 to cell{n}: give them the names of the cells")
     dates = next((c for c in left if c.is_date and not c.of_recording), None)
     numeric = [c for c in left if c.is_numeric and not c.of_recording]
     time = (

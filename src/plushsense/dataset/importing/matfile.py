@@ -2,7 +2,7 @@
 
 The format is that of MathWorks' *MAT-File Format*; it says nothing about objects such as categorical arrays, whose
 properties are in a file of its own inside. That part is described in github.com/foreverallama/matio,
-docs/subsystem_data_format.md. SciPy reads no objects, and some damaged files make it crash the interpreter.
+docs/subsystem_data_format.md. SciPy 1.17 drops the names of objects, and damaged files make it crash the interpreter.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +29,6 @@ _TEXTS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18
 _CELL, _STRUCT, _CHAR, _OPAQUE = 1, 2, 4, 17
 _NUMBERS = range(6, 16)
 _COMPLEX = 0x0800
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-_TEXT = "is text, as save -ascii writes it"
-_ORDERS: tuple[Literal["little", "big"], ...] = ("little", "big")
-_PRINTABLE = {*b"\t\n\r", *range(32, 127)}
 
 
 @dataclass(frozen=True)
@@ -204,24 +200,6 @@ def texts_of(cells: NDArray[Any]) -> list[str]:
     return ["".join(cell) for cell in found]
 
 
-def _other_format(data: bytes) -> str:
-    """Return which format of MATLAB a file has instead of version 5; "" if none is known.
-
-    The head of version 5 ends in its version and byte order; 7.3 is HDF5 behind such a head, and version 4 begins with
-    a number below 5000.
-    """
-    version = data[_HEAD - 4 : _HEAD]
-    behind_head = version in (b"\x00\x02IM", b"\x02\x00MI") or data.startswith(b"MATLAB 7.3")
-    if behind_head or any(data[at : at + 8] == _HDF5 for at in (0, 512, 1024, 2048)):
-        return "has the format 7.3"
-    if version[2:] in (b"IM", b"MI"):
-        return ""
-    if len(data) > 20 and b"\0" in data[:4] and min(int.from_bytes(data[:4], order) for order in _ORDERS) < 5000:
-        return "has the format 4"
-    text = data.strip() and not set(data[:4096]) - _PRINTABLE
-    return _TEXT if text else ""
-
-
 def read_mat(path: Path, display_name: str) -> dict[str, Any]:
     """Read the variables of a MATLAB file.
 
@@ -234,11 +212,13 @@ def read_mat(path: Path, display_name: str) -> dict[str, Any]:
     """
     try:
         data = path.read_bytes()
-        if other := _other_format(data):
-            again = "load it and write it again with  save(file, '-v7')  in MATLAB, or  save -v7 file  in Octave"
-            if other == _TEXT:
-                again += "; a table of numbers can also be described with --pattern (--guess FILE.toml begins one)"
-            raise FileFormatError(f"'{display_name}' {other}, which is not read: {again}")
+        # The head of version 5 ends in its version and byte order; 7.3 is HDF5 behind such a head.
+        if data[_HEAD - 4 : _HEAD] not in (b"\x00\x01IM", b"\x01\x00MI") or data.startswith(b"MATLAB 7.3"):
+            raise FileFormatError(
+                f"'{display_name}' does not have the MATLAB format that  save(file, '-v7')  writes, but another one "
+                "such as 7.3, 4 or text: load it and save it so, in Octave with  save -v7 file; a text table can also "
+                "be described with --pattern"
+            )
         reader, rest = _open(data, _HEAD)
         variables = list(reader.variables(rest))
         # The file inside is an array without a name.

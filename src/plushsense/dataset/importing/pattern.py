@@ -113,12 +113,8 @@ class ImportPattern:
         decimal: sign before the decimals.
         missing: words in place of a value, such as ``OL``, or an empty text for an empty cell. The row stays, and the
             value counts as invalid, so that readers repeat the last valid one (default: such rows are left out).
-        bits: columns whose characters, joined in this order, are one digit for each channel without its own column,
-            such as ``00101100``.
         between: regular expression of whole lines that separate recordings, such as ``START.*``; ``none``: no line does
             (default: empty lines, rows of empty cells, comments with #, % or //, and repeated lines of column names).
-        recording_rows: number of rows that are one recording, in files that hold recordings of equal length one after
-            the other; 1 is refused, 0: recordings have any length (from 0).
         row_rate_hz: rows for each second, for files without a clock. Rows that are left out take their time, too; 0:
             there is a column of times (from 0).
         time_unit: unit of times; ``iso`` for dates and for times such as ``12:01:02.5``, ``d`` for days, as those of
@@ -148,9 +144,7 @@ class ImportPattern:
     separator: str = ""
     decimal: Literal[".", ","] = "."
     missing: tuple[str, ...] = ()
-    bits: tuple[str, ...] = ()
     between: str = ""
-    recording_rows: int = 0
     row_rate_hz: float = 0.0
     time_unit: Literal["", "d", "s", "ms", "us", "ns", "iso"] = ""
     intervals: str = ""
@@ -168,8 +162,6 @@ class ImportPattern:
         for key in ("skip_before", "skip_after"):
             if getattr(self, key) < 0:
                 yield key, f"{key} is {getattr(self, key)}: accepted are 0 and more lines."
-        if self.recording_rows < 0 or self.recording_rows == 1:
-            yield "recording_rows", f"recording_rows is {self.recording_rows}: accepted are 0 and 2 or more rows."
         try:
             re.compile(self.between)
         except re.error as cause:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -19,8 +19,8 @@ from plushsense.core.layouts import ACCELERATION, MEASURED, Layout
 from plushsense.core.sentences import join_names
 from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.quality.outliers import find_failed_readings
+from plushsense.dataset.statistics import median_gesture_s
 from plushsense.dataset.store import Dataset, RecordingInfo
-from plushsense.recording.takes import duration_s
 
 DEFAULT_WINDOW_S = 2.5
 # Clocks have whole milliseconds: a faster one has rows in another unit than it says.
@@ -455,14 +455,3 @@ def _window(dataset: Dataset) -> Iterator[Proposal]:
             "mostly begin before their gesture",
             proven=False,
         )
-
-
-def median_gesture_s(dataset: Dataset, gestures: Iterable[str] | None = None) -> float | None:
-    """Return the median duration of the used recordings in seconds, of all or some gestures; None without any."""
-    chosen = None if gestures is None else set(gestures)
-    seconds = [
-        duration_s(r.stop - r.start, r.rate_hz or dataset.layout.rate_hz)
-        for r in dataset.used
-        if chosen is None or r.gesture in chosen
-    ]
-    return float(np.median(seconds)) if seconds else None

@@ -15,7 +15,7 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.archives import unpack
-from plushsense.dataset.importing.folders import scan_folder
+from plushsense.dataset.importing.folders import find_people, scan_folder
 from plushsense.dataset.importing.intervals import read_intervals
 from plushsense.dataset.importing.pattern import ImportPattern, check_roles
 from plushsense.dataset.importing.results import NO_PEOPLE_OF_PATTERN, group_flags
@@ -33,7 +33,6 @@ from plushsense.dataset.importing.sources import (
     source_files,
     split_regular_files,
 )
-from plushsense.dataset.importing.streams import find_people
 from plushsense.dataset.importing.tables import ABOUT_FILE, TableImport
 from plushsense.dataset.importing.xdf import ENDINGS, convert_xdf
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT
@@ -174,7 +173,7 @@ def scan_source(source: Path, spec: ScanSpec) -> SourceScan:
     except FileFormatError as cause:
         raise FileFormatError("'{source}': {cause}.", source=source, cause=cause.message) from None
     if spec.streams is not None:
-        find_people(scan, spec.streams)
+        find_people(scan, spec.streams, spec)
     if not any(f.kind in (RECORDINGS, STREAMS) for f in scan.found):
         raise _nothing_found(source, spec, scan)
     return scan

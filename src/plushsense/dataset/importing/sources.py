@@ -40,8 +40,7 @@ class SourceFile:
     ``kind`` is recordings, streams, companions (copied beside another file but not read), left out (not needed), or ""
     for a refused file with its ``reason``. ``origin`` is its name in messages. ``beside`` is the file that a companion
     belongs to, None for its session's folder. ``set_aside`` is the reason why the recorder discarded the recording.
-    ``gesture`` is the label of the folder of a recording whose name has another one. ``cut`` is the file, without the
-    first rows, in whose place the recording is imported.
+    ``gesture`` is the label of the folder of a recording whose name has another one.
     """
 
     source: Path
@@ -53,7 +52,6 @@ class SourceFile:
     beside: Path | None = None
     set_aside: str = ""
     gesture: str = ""
-    cut: Path | None = None
 
 
 @dataclass

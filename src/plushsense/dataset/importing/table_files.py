@@ -16,13 +16,14 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from math import inf, isfinite, isnan
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import FileFormatError, need
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
+from plushsense.core.sentences import Message
 from plushsense.core.toml import loads_json
 from plushsense.dataset.importing.pattern import INTERVAL, PARTS, ROLES, UNITS, ImportPattern
 
@@ -42,39 +43,21 @@ class ImportedColumns:
         names: column of each role or channel.
         texts: person, session, label and take of each row, as far as there are such columns.
         numbers: channels and clocks (T,): NaN if a cell is no number, infinite for a missing-value word.
-        malformed: number of rows that are not like the others.
-        first_malformed: the first of these, as "line 12: '3,4'".
-        why_malformed: how they differ.
+        blocks: number of the block of each row (T,), from 0: lines between recordings separate blocks.
+        notes: what is to be said about rows that are not like the others.
         lines: line of the file of each row, from 1; empty if the format has no lines.
         in_ms: whether the times were dates and are milliseconds now.
         own_recordings: whether the file tells recordings apart itself, as by objects that hold whole recordings.
-        row_numbers: number of each row, from 0, with those that are left out; empty if no row is left out.
-        blocks: number of the block of each row, from 0: lines between recordings separate blocks; empty for one block.
-        text_lines: number of malformed rows that hold text only.
     """
 
     names: dict[str, str]
     texts: dict[str, list[str]]
     numbers: dict[str, NDArray[np.float64]]
-    malformed: int = 0
-    first_malformed: str = ""
-    why_malformed: str = "of another width than the header"
+    blocks: NDArray[np.int64]
+    notes: list[Message] = field(default_factory=list)
     lines: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     in_ms: bool = False
     own_recordings: bool = False
-    row_numbers: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    blocks: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    text_lines: int = 0
-
-    @property
-    def block_of_row(self) -> NDArray[np.int64]:
-        """Number of the block of each row (T,)."""
-        return self.blocks if len(self.blocks) else np.zeros(len(self.numbers["time"]), dtype=np.int64)
-
-    @property
-    def number_of_row(self) -> NDArray[np.int64]:
-        """Number of each row (T,), with those that are left out."""
-        return self.row_numbers if len(self.row_numbers) else np.arange(len(self.numbers["time"]), dtype=np.int64)
 
 
 _TIME_OF_DAY = re.compile(r"(?:(\d+):)?(\d+):(\d+(?:[.,]\d+)?)")
@@ -145,7 +128,7 @@ class TableFile:
             at = self.column_index(names, plain)
             if at is not None:
                 chosen[role] = at
-            elif role in given or (role in needed and not (self.pattern.bits and role in layout.names)):
+            elif role in given or role in needed:
                 if not any(plain):
                     raise self.error(
                         "'{file}' begins with no line of column names: a table needs a header{names}",
@@ -205,27 +188,23 @@ class TableFile:
 
         return date if self.pattern.time_unit == "iso" and role in ("time", HOST_MS) else number
 
-    def digits(self, texts: Iterable[str], n: int) -> list[float] | None:
-        """Return the ``n`` digits of a row whose channels are characters; None if there is another number of them."""
-        text = "".join("".join(texts).split())
-        return [float(c) if c in "0123456789" else _NOT_A_NUMBER for c in text] if len(text) == n else None
 
-
+@dataclass
 class _Rows:
-    """Rows that are read one by one, as columns; ``roles`` are those of the cells of each row."""
+    """Rows that are read one by one, as columns; a row has a cell for each of the roles in ``names``."""
 
-    def __init__(self, file: TableFile, at: Mapping[str, int], there: Sequence[str], extra: Sequence[str] = ()) -> None:
-        self._file = file
-        self.roles = (*at, *extra)
-        self._by_digit = bit_channels(file, at)
-        self.names = {role: there[index].strip() for role, index in at.items()}
-        self.names |= {name: "+".join(file.pattern.bits) for name in self._by_digit}
-        self.texts: dict[str, list[str]] = {role: [] for role in self.roles if role in PARTS}
-        self.numbers = {role: array("d") for role in (*self.roles, *self._by_digit) if role not in PARTS}
-        self.lines = array("q")
-        self.malformed, self.first, self.text_lines = 0, "", 0
-        self._between: dict[int, float] = {}
-        self.why_malformed = ImportedColumns.why_malformed
+    file: TableFile
+    names: dict[str, str]
+    why_malformed: str = "of another width than the header"
+    texts: dict[str, list[str]] = field(default_factory=dict)
+    numbers: dict[str, array[float]] = field(default_factory=dict)
+    lines: array[int] = field(default_factory=lambda: array("q"))
+    _between: dict[int, float] = field(default_factory=dict)
+    _malformed: list[int] = field(default_factory=list)
+    _first: str = ""
+    _has_text_lines: bool = False
+
+    def __post_init__(self) -> None:
         same: dict[str, str] = {}
 
         def text_of(cell: str) -> str:
@@ -233,113 +212,88 @@ class _Rows:
             return same.setdefault(text, text)
 
         # One function for each cell of a row: a table may have millions of cells.
-        self._store: list[tuple[Callable[[Any], None], Callable[[str], Any]]] = [
-            (self.texts[r].append, text_of) if r in self.texts else (self.numbers[r].append, file.parser(r))
-            for r in self.roles
-        ]
+        self._store: list[tuple[Callable[[Any], None], Callable[[str], Any]]] = []
+        for role in self.names:
+            if role in PARTS:
+                self._store.append((self.texts.setdefault(role, []).append, text_of))
+            else:
+                self._store.append((self.numbers.setdefault(role, array("d")).append, self.file.parser(role)))
 
-    def add(self, line: int, cells: Iterable[str], bits: Iterable[str] = ()) -> bool:
-        """Add a row, with its cell for each role; return False for another number of digits than channels."""
-        if self._by_digit:
-            digits = self._file.digits(bits, len(self._by_digit))
-            if digits is None:
-                return False
-            for name, value in zip(self._by_digit, digits, strict=True):
-                self.numbers[name].append(value)
+    def add(self, line: int, cells: Iterable[str]) -> None:
+        """Add a row, with its cell for each role."""
         for (store, read), cell in zip(self._store, cells, strict=True):
             store(read(cell))
         self.lines.append(line)
-        return True
 
     def pass_over(self, lines: float) -> None:
         """Count ``lines`` that are no rows, before the next row; infinitely many always separate recordings."""
         self._between[len(self.lines)] = self._between.get(len(self.lines), 0) + lines
 
     def leave_out(self, line: int, text: str, *, is_text: bool = False) -> None:
-        self.malformed += 1
-        self.text_lines += is_text
-        if not self.first:
-            self.first = f"line {line}: '{text.strip()[:60]}'"
+        """Count a row that is not like the others."""
+        self._malformed.append(len(self.lines))
+        self._has_text_lines |= is_text
+        self._first = self._first or f"line {line}: '{text.strip()[:60]}'"
 
-    def columns(self, row_numbers: Sequence[int], own_recordings: bool = False) -> ImportedColumns:
-        """Return the columns; ``row_numbers`` are the numbers of all rows, from which times follow without a clock."""
+    def columns(self, own_recordings: bool = False) -> ImportedColumns:
+        """Return the columns. Without a clock, rows that are left out have taken their time, too."""
+        rate, rows = self.file.pattern.row_rate_hz, len(self.lines)
+        names, blocks = self.names, number_blocks(self._between, rows)
         numbers = {role: np.array(values, dtype=np.float64) for role, values in self.numbers.items()}
-        rate, blocks = self._file.pattern.row_rate_hz, number_blocks(self._between, len(self.lines))
         if rate:
-            numbers["time"] = np.array(row_numbers, dtype=np.float64) * (1000.0 / rate) + blocks * _APART_MS
-        return ImportedColumns(
-            self.names | ({"time": "row number"} if rate else {}),
-            self.texts,
-            numbers,
-            self.malformed,
-            self.first,
-            self.why_malformed,
-            np.array(self.lines, dtype=np.int64),
-            bool(rate) or self._file.pattern.time_unit == "iso",
-            own_recordings,
-            np.array(row_numbers, dtype=np.int64),
-            blocks,
-            self.text_lines,
-        )
+            before = np.searchsorted(self._malformed, np.arange(rows), side="right")
+            numbers["time"] = (np.arange(rows) + before) * (1000.0 / rate) + blocks * _APART_MS
+            names = names | {"time": "row number"}
+        notes = []
+        if count := len(self._malformed):
+            ask = "; if such lines separate recordings, describe them with  between  in a pattern"
+            notes.append(left_out_note(count, self.why_malformed, self._first + ask * self._has_text_lines))
+        in_ms = bool(rate) or self.file.pattern.time_unit == "iso"
+        lines = np.array(self.lines, dtype=np.int64)
+        return ImportedColumns(names, self.texts, numbers, blocks, notes, lines, in_ms, own_recordings)
 
 
-def bit_channels(file: TableFile, at: Mapping[str, int]) -> list[str]:
-    """Return the channels that are digits of the columns ``bits``: those without a column of their own."""
-    return [name for name in file.layout.names if name not in at] if file.pattern.bits else []
+def left_out_note(count: int, reason: str, first: str) -> Message:
+    """Return the note that rows are left out, with where the ``first`` of them stands, "" if that is not known."""
+    at = f" (the first: {first})" if first else ""
+    return Message("{n} row{more} {reason} left out{at}", n=count, more="s" if count > 1 else "", reason=reason, at=at)
 
 
 def read_csv(file: TableFile) -> ImportedColumns:
     """Read a table of text with a header; skip lines of another width. See `ImportPattern` for what can differ."""
     pattern = file.pattern
-    try:
-        with file.path.open(encoding=pattern.text_encoding, newline="") as text:
-            for _ in range(pattern.skip_before):
+    with file.path.open(encoding=pattern.text_encoding, newline="") as text:
+        for _ in range(pattern.skip_before):
+            text.readline()
+        first = text.readline()
+        separator = pattern.separator or max(_SEPARATORS, key=first.count)
+        if file.place is not None and not pattern.separator and separator not in first and len(first.split()) > 1:
+            separator = " "
+        skipped, begin, there = pattern.skip_before, [first], list(pattern.names)
+        if not there:
+            there, begin = next(_split([first], separator), []), []
+            skipped += 1 + pattern.skip_after
+            for _ in range(pattern.skip_after):
                 text.readline()
-            skipped = pattern.skip_before
-            first = text.readline()
-            separator = pattern.separator or max(_SEPARATORS, key=first.count)
-            if file.place is not None and not pattern.separator and separator not in first and len(first.split()) > 1:
-                separator = " "
-            if pattern.names:
-                there, begin = list(pattern.names), [first]
+        at = file.choose_columns(there)
+        rows = _Rows(file, {role: there[index].strip() for role, index in at.items()})
+        for line, row in _numbered(itertools.chain(begin, text), separator, skipped):
+            while len(row) > len(there) and not row[-1].strip():
+                row.pop()
+            if is_between(row, there, pattern):
+                rows.pass_over(inf if row and row[0].strip() else 1)
+                continue
+            if not row:
+                continue
+            if row[-1].endswith(";"):
+                # Some loggers end each line so.
+                row[-1] = row[-1].rstrip("; ")
+            # Spreadsheets save a line of text as a row with text in its first cell only.
+            if len(row) == len(there) and (row[-1] or any(row[1:]) or not (row[0] and is_text(row))):
+                rows.add(line, [row[k] for k in at.values()])
             else:
-                there, begin = next(_split([first], separator), []), []
-                skipped += 1
-                for _ in range(pattern.skip_after):
-                    text.readline()
-                skipped += pattern.skip_after
-            at = file.choose_columns(there)
-            bits_at = [_bit_column(file, name, there) for name in pattern.bits]
-            rows = _Rows(file, at, there)
-            places = list(at.values())
-            numbers, row_number = array("q"), 0
-            for line, row in _numbered(text, begin, separator, skipped):
-                while len(row) > len(there) and not row[-1].strip():
-                    row.pop()
-                if is_between(row, there, pattern):
-                    rows.pass_over(inf if row and row[0].strip() else 1)
-                    continue
-                if not row:
-                    continue
-                if row[-1].endswith(";"):
-                    # Some loggers end each line so.
-                    row[-1] = row[-1].rstrip("; ")
-                # Spreadsheets save a line of text as a row with text in its first cell only.
-                whole = len(row) == len(there) and (bool(row[-1] or any(row[1:])) or not (row[0] and is_text(row)))
-                if whole and rows.add(line, [row[k] for k in places], [row[k] for k in bits_at]):
-                    numbers.append(row_number)
-                else:
-                    rows.leave_out(line, separator.join(row), is_text=is_text(row))
-                # Rows that are left out have taken their time too.
-                row_number += 1
-    except UnicodeError:
-        hint = ", or name its encoding in the pattern" if file.place is not None else ""
-        raise file.error(
-            "'{file}' is not {encoding}: save it as UTF-8{hint}", encoding=pattern.encoding.upper(), hint=hint
-        ) from None
-    except csv.Error as cause:
-        raise file.error("'{file}' is no CSV table: {cause}", cause=cause) from None
-    return rows.columns(numbers)
+                rows.leave_out(line, separator.join(row), is_text=is_text(row))
+    return rows.columns()
 
 
 def is_between(row: Sequence[str], there: Sequence[str], pattern: ImportPattern) -> bool:
@@ -383,33 +337,19 @@ def _split(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
     return csv.reader(lines, delimiter=separator)
 
 
-def _numbered(text: TextIO, begin: list[str], separator: str, skipped: int) -> Iterator[tuple[int, list[str]]]:
+def _numbered(lines: Iterable[str], separator: str, skipped: int) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of the line, from 1, and the cells of each row behind ``skipped`` lines."""
     if separator == " ":
-        yield from enumerate(_split(itertools.chain(begin, text), separator), skipped + 1)
+        yield from enumerate(_split(lines, separator), skipped + 1)
         return
-    reader = csv.reader(itertools.chain(begin, text), delimiter=separator)
+    reader = csv.reader(lines, delimiter=separator)
     for row in reader:
         yield skipped + reader.line_num, row
 
 
-def _bit_column(file: TableFile, name: str, there: Sequence[str]) -> int:
-    at = file.column_index((name,), [t.strip().casefold() for t in there])
-    if at is None:
-        listed = ", ".join(filter(None, (t.strip()[:30] for t in there[:20]))) or "no names"
-        raise file.error(
-            "'{file}' has no column '{column}', which bits names; it has {there}", column=name, there=listed
-        )
-    return at
-
-
 def read_json(file: TableFile) -> ImportedColumns:
     """Read JSON objects, one a line or in a list: an object is a row, or a recording if its values are lists."""
-    path = file.path
-    try:
-        text = path.read_text(encoding=file.pattern.text_encoding)
-    except UnicodeError:
-        raise file.error("'{file}' is not {encoding}: save it as UTF-8{hint}", encoding="UTF-8", hint="") from None
+    text = file.path.read_text(encoding=file.pattern.text_encoding)
     try:
         objects = one_recording_each(json_objects(text))
         first = next((item for _, item in objects if isinstance(item, dict)), None)
@@ -419,60 +359,45 @@ def read_json(file: TableFile) -> ImportedColumns:
     if first is None:
         raise file.error("'{file}' holds no JSON object: accepted is one object a line, or a list of objects")
     at = file.choose_columns(there)
-    for name in file.pattern.bits:
-        _bit_column(file, name, there)
     paths = [there[k].split(".") for k in at.values()]
-    in_objects = _length([_value(first, path) for path in paths]) is not None
-    # An object that holds a whole recording tells it apart from others by its number.
-    numbered = ("recording",) if in_objects and "recording" not in at else ()
-    rows = _Rows(file, at, there, numbered)
-    rows.why_malformed = "without a JSON object whose lists have one length"
-    numbers, row_number, lists = array("q"), 0, False
+    names = {role: there[k].strip() for role, k in at.items()}
+    if _length([_value(first, path) for path in paths]) is not None and "recording" not in at:
+        # An object that holds a whole recording tells it apart from others by its number.
+        names["recording"] = ""
+    numbered = len(names) > len(at)
+    rows, lists = _Rows(file, names, "without a JSON object whose lists have one length"), False
     for number, (line, item) in enumerate(objects):
         values = [_value(item, path) for path in paths] if isinstance(item, dict) else []
-        bits = [_value(item, name.split(".")) for name in file.pattern.bits]
-        length = _length([*values, *bits]) if isinstance(item, dict) else -1
-        lists |= length not in (None, -1)
+        length = _length(values) if isinstance(item, dict) else -1
         if length == -1:
             rows.leave_out(line, str(item))
-            row_number += 1
             continue
+        lists |= length is not None
         for k in range(1 if length is None else length):
-            cells = [_cell(value, k) for value in values] + [str(number) for _ in numbered]
-            if rows.add(line, cells, [_cell(b, k) for b in bits]):
-                numbers.append(row_number)
-            else:
-                rows.leave_out(line, str(item))
-            row_number += 1
-    return rows.columns(numbers, own_recordings=lists)
+            rows.add(line, [_cell(value, k) for value in values] + [str(number)] * numbered)
+    columns = rows.columns(own_recordings=lists)
+    return replace(columns, names={role: name for role, name in columns.names.items() if name}) if numbered else columns
 
 
 def json_objects(text: str) -> list[tuple[int, Any]]:
     """Return the line, from 1 (in a list the number of the item), and the value of each object; a text if damaged."""
-    return list(_objects(text))
-
-
-def _objects(text: str) -> Iterator[tuple[int, Any]]:
     if text.lstrip()[:1] == "[":
-        try:
-            yield from enumerate(loads_json(text), 1)
-        except (ValueError, RecursionError):
-            yield 1, text
-        return
+        found = _loaded(text)
+        return [(1, found)] if found is text else list(enumerate(found, 1))
     # Texts may hold other characters that `splitlines` takes for line ends.
     lines = [(line, row) for line, row in enumerate(text.split("\n"), 1) if row.strip()]
-    for line, row in lines:
-        try:
-            value = loads_json(row)
-        except (ValueError, RecursionError):
-            # A text is no object, and shows in messages what the line holds.
-            value = row
-            if line == lines[0][0]:
-                # A single object may take many lines.
-                with contextlib.suppress(ValueError, RecursionError):
-                    yield line, loads_json(text)
-                    return
-        yield line, value
+    if lines and _loaded(lines[0][1]) is lines[0][1] and (whole := _loaded(text)) is not text:
+        # A single object may take many lines.
+        return [(lines[0][0], whole)]
+    return [(line, _loaded(row)) for line, row in lines]
+
+
+def _loaded(text: str) -> Any:
+    """Return a JSON value; the text itself, which messages quote, if it is damaged."""
+    try:
+        return loads_json(text)
+    except (ValueError, RecursionError):
+        return text
 
 
 # Lists of so many values are series of samples; shorter ones are rather the axes of one sample.
@@ -623,11 +548,8 @@ def read_parquet(file: TableFile) -> ImportedColumns:
         if opened.read(4) != b"PAR1":
             raise file.error("'{file}' is no Parquet file: it does not begin with PAR1")
     pattern = file.pattern
-    if pattern.bits or pattern.missing:
-        key = "bits" if pattern.bits else "missing"
-        raise file.error(
-            "'{file}' is a Parquet table, whose columns have types: {key} is for text, leave it out", key=key
-        )
+    if pattern.missing:
+        raise file.error("'{file}' is a Parquet table, whose columns have types: missing is for text, leave it out")
     pl = need("polars", extra="tables")
     try:
         with file.path.open("rb") as opened:
@@ -665,7 +587,7 @@ def read_parquet(file: TableFile) -> ImportedColumns:
     if pattern.row_rate_hz:
         numbers["time"] = np.arange(len(table), dtype=np.float64) * (1000.0 / pattern.row_rate_hz)
         names["time"], in_ms = "row number", True
-    return ImportedColumns(names, texts, numbers, in_ms=in_ms)
+    return ImportedColumns(names, texts, numbers, np.zeros(len(table), dtype=np.int64), in_ms=in_ms)
 
 
 def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
@@ -690,7 +612,14 @@ def read_rows(file: TableFile) -> ImportedColumns:
         FileFormatError: for a table that cannot be read or lacks a column.
         MissingExtraError: for Parquet without polars.
     """
-    columns = READERS[file.pattern.format_of(file.path)](file)
+    try:
+        columns = READERS[file.pattern.format_of(file.path)](file)
+    except UnicodeError:
+        hint = ", or name its encoding in the pattern" if file.place is not None else ""
+        encoding = file.pattern.encoding.upper()
+        raise file.error("'{file}' is not {encoding}: save it as UTF-8{hint}", encoding=encoding, hint=hint) from None
+    except csv.Error as cause:
+        raise file.error("'{file}' is no CSV table: {cause}", cause=cause) from None
     if INTERVAL not in columns.numbers:
         return columns
     times = np.cumsum(columns.numbers[INTERVAL])

@@ -5,8 +5,8 @@ recording or stream.
 
 Rows are grouped by person and session, in the order of the file. A recording is a run of rows with the same label (and
 the same ``recording``, if there is such a column); without that column it also ends where the time decreases or pauses
-for more than a second. Empty lines, and the other lines of ``between`` in `ImportPattern`, end a recording too, and so
-does every ``recording_rows`` rows. A file whose path names the label or the take is one recording otherwise.
+for more than a second. Empty lines, and the other lines of ``between`` in `ImportPattern`, end a recording too. A file
+whose path names the label or the take is one recording otherwise.
 
 Rows without a label, or with one of ``idle``, belong to no recording. A session with such rows is also written as
 stream, and so is one in which most recordings begin where the one before ends.
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -41,7 +41,14 @@ from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.intervals import IntervalFile, label_rows
 from plushsense.dataset.importing.pattern import UNITS, ImportPattern
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
-from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, forward_steps, read_rows, unit_of_time
+from plushsense.dataset.importing.table_files import (
+    ImportedColumns,
+    TableFile,
+    forward_steps,
+    left_out_note,
+    read_rows,
+    unit_of_time,
+)
 from plushsense.dataset.quality.measurements import SLOW_FACTOR, in_order, rows_at_one_time
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
@@ -200,9 +207,8 @@ PAUSE_MS = 1000.0
 class _TableSamples:
     """The usable rows of a table: their ``frames`` (T,), and the number of each one's person, session, label and take.
 
-    ``row`` (T,) are the numbers of the rows in the file, with those that are left out.
-
     ``people``, ``sessions`` and ``labels`` have the texts of these numbers; labels are as the source spells them.
+    ``apart``: the file itself tells its recordings apart.
     """
 
     frames: Frames
@@ -210,18 +216,17 @@ class _TableSamples:
     session: NDArray[np.int64]
     label: NDArray[np.int64]
     take: NDArray[np.int64]
-    row: NDArray[np.int64]
     people: list[str]
     sessions: list[str]
     labels: list[str]
+    apart: bool
 
 
 @dataclass
 class TableImport:
     """Conversion of tables into recordings below the new ``folder``.
 
-    ``person`` is the person of files that name none, None if it is not known. ``intervals`` are the files that label
-    the rows of tables, if the pattern names such files.
+    ``intervals`` are the files that label the rows of tables, if the pattern names such files.
     """
 
     folder: Path
@@ -236,49 +241,52 @@ class TableImport:
     def convert(
         self, path: Path, display_name: str, person: str | None, place: Mapping[str, str] | None = None
     ) -> Iterator[SourceFile | Message]:
-        """Write the recordings of a table; yield the files, and warnings as `about_file` makes them.
+        """Write the recordings of a table; yield the files, and notes as `about_file` makes them.
 
-        ``place`` are the parts of the path, None without a pattern, when each session gets its ``origin.json`` at once.
+        Args:
+            person: the person of a file that names none; None if it is not known.
+            place: the parts of the path, None without a pattern, when each session gets its ``origin.json`` at once.
 
         Raises:
             FileFormatError: for a table that cannot be read, lacks a column, or has no usable row.
             MissingExtraError: for Parquet without polars.
         """
         table = TableFile(path, display_name, self.layout, self.pattern, place)
+        for entry in self._convert(table, person):
+            yield entry if isinstance(entry, SourceFile) else about_file(display_name, entry)
+
+    def _convert(self, table: TableFile, person: str | None) -> Iterator[SourceFile | str]:
         columns = read_rows(table)
-        place = place or {}
-        notes: list[Message] = []
         if self.pattern.intervals:
-            columns = self._labelled(table, columns, notes)
-        subject = place.get("subject", person)
+            columns, notes = self._labelled(table, columns)
+            yield from notes
+        subject = (table.place or {}).get("subject", person)
         if "subject" not in columns.names and subject is None:
             raise table.error(
                 "'{file}' has no column 'subject': {hint}, or the person with --subjects map.csv (file,subject)",
                 hint=table.hint("subject"),
                 needs="person",
             )
-        samples = self._samples(table, columns, subject or "", notes)
-        yield from notes
-        if not len(samples.frames):
+        samples = yield from self._samples(table, columns, subject or "")
+        every = samples.frames
+        if not len(every):
             raise table.error(
                 "'{file}' has no usable row: each needs a subject, a time and {n} numbers", n=self.layout.n_channels
             )
         group = samples.person * len(samples.sessions) + samples.session
         order = np.argsort(group, kind="stable")
         edges = [0, *(np.flatnonzero(np.diff(group[order])) + 1).tolist(), len(order)]
-        original = ConvertedSource(path, display_name, {"columns": columns.names})
-        apart = "recording" in columns.names or columns.own_recordings or bool({"label", "recording"} & set(place))
-        apart |= self.pattern.recording_rows > 0
+        original = ConvertedSource(table.path, table.display_name, {"columns": columns.names})
         for first, last in itertools.pairwise(edges):
             mine = order[first:last]
-            moved = in_order(samples.frames.device_ms[mine])
+            moved = in_order(every.device_ms[mine])
             if table.place is not None and (n := int(np.sum(moved != np.arange(len(moved))))):
-                yield about_file(display_name, f"{n} rows put into the order of their times")
+                yield f"{n} rows put into the order of their times"
                 mine = mine[moved]
-            yield from self._write(table, original, samples, mine, apart)
+            yield from self._write(table, original, samples, mine)
 
-    def _labelled(self, table: TableFile, columns: ImportedColumns, notes: list[Message]) -> ImportedColumns:
-        """Label the rows of a table by the file of intervals that belongs to it."""
+    def _labelled(self, table: TableFile, columns: ImportedColumns) -> tuple[ImportedColumns, list[str]]:
+        """Label the rows of a table by the file of intervals that belongs to it; return them, and notes."""
         mine = [intervals for intervals in self.intervals if intervals.fits(table.place or {})]
         if len(mine) != 1:
             listed = f"several files of intervals ({', '.join(i.name for i in mine[:3])})" if mine else "no such file"
@@ -288,133 +296,117 @@ class TableImport:
                 listed=listed,
                 intervals=self.pattern.intervals,
             )
-        times = columns.numbers["time"]
-        factor, _ = self._factor(columns, times)
-        labelled, found = label_rows(columns, times * factor, mine[0], factor)
-        notes += [about_file(table.display_name, note) for note in found]
-        return labelled
+        factor, _ = self._factor(columns)
+        return label_rows(columns, columns.numbers["time"] * factor, mine[0], factor)
 
-    def _samples(self, table: TableFile, columns: ImportedColumns, subject: str, notes: list[Message]) -> _TableSamples:
-        """Return the usable rows of a table as samples; add what is to be said about the file to ``notes``."""
-        name, place = table.display_name, table.place or {}
-        times = columns.numbers["time"]
-        factor, note = self._factor(columns, times)
-        notes += [about_file(name, note)] if note else []
-        device = times * factor
-        notes += _too_fine(table, columns, device)
+    def _samples(
+        self, table: TableFile, columns: ImportedColumns, subject: str
+    ) -> Generator[SourceFile | str, None, _TableSamples]:
+        """Return the usable rows of a table as samples; yield what is to be said about the file."""
+        place = table.place or {}
+        factor, note = self._factor(columns)
+        device = columns.numbers["time"] * factor
+        steps = forward_steps(device)
+        if note:
+            yield note
+        if len(steps) and float(np.median(steps)) < _FINEST_MS:
+            yield Message(
+                "by column '{column}', rows are {step:g} ms apart, but times are kept in whole ms: is its unit right?",
+                column=columns.names["time"],
+                step=float(np.median(steps)),
+            )
         host = columns.numbers.get(HOST_MS, device)
-        rows = len(device)
 
         def part(role: str, otherwise: str) -> tuple[NDArray[np.int64], list[str]]:
-            return _codes(columns.texts.get(role) or itertools.repeat(place.get(role, otherwise), rows))
+            return _codes(columns.texts.get(role) or itertools.repeat(place.get(role, otherwise), len(device)))
 
-        people, codes = part("subject", subject)
+        person, people = part("subject", subject)
         # Files with rows between their recordings are sessions of their own, since each is a stream.
         own_session = table.place is not None and not place.get("label")
-        sessions, session_names = part("session", table.path.stem if own_session else "")
-        labels, spellings = part("label", "")
-        takes, _ = part("recording", "")
-        takes = takes * (int(columns.block_of_row.max(initial=0)) + 1) + columns.block_of_row
+        session, sessions = part("session", table.path.stem if own_session else "")
+        label, labels = part("label", "")
+        take, _ = part("recording", "")
+        blocks = int(columns.blocks.max(initial=0)) + 1
         raw = np.column_stack([columns.numbers[n] for n in self.layout.names])
         invalid = np.isinf(raw)
         raw[invalid] = 0.0
         good = usable_rows(raw, device, host)
-        known = np.array([bool(c) for c in codes], dtype=bool)[people] if rows else np.empty(0, bool)
-        notes += _left_out(table, columns, good, known)
-        notes += _blocks(table, columns)
+        known = np.array([bool(code) for code in people], dtype=bool)[person]
+        yield from columns.notes
+        for bad, reason in ((~good, "without a number in every column"), (good & ~known, "without a subject")):
+            if count := int(np.sum(bad)):
+                first = f"line {columns.lines[int(np.argmax(bad))]}" if len(columns.lines) else ""
+                yield left_out_note(count, reason, first)
+        if blocks > 1:
+            yield Message(
+                "{n} blocks of rows, separated by empty lines, comments or repeated column names, are recordings of "
+                "their own{join}",
+                n=blocks,
+                join=': between = "none" in the pattern joins them' if table.place is not None else "",
+            )
         good &= known
         values, note = whole_steps(raw[good], self.layout)
-        notes += [about_file(name, note)] if note else []
+        if note:
+            yield note
         if count := int(invalid[good].sum()):
             # A value beyond the valid range is invalid for every reader, which repeats the last valid one.
             values = np.where(invalid[good], self.layout.valid_max_int + 1, values)
             words = ", ".join(f"'{word}'" for word in self.pattern.missing)
-            notes.append(about_file(name, f"{count} values are missing ({words}): they count as invalid"))
-        device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
-        frames = Frames(values, device_ms, host_ms)
-        return _TableSamples(
-            frames,
-            people[good],
-            sessions[good],
-            labels[good],
-            takes[good],
-            columns.number_of_row[good],
-            codes,
-            session_names,
-            spellings,
-        )
+            yield f"{count} values are missing ({words}): they count as invalid"
+        frames = Frames(values, *(np.round(clock[good]).astype(np.int64) for clock in (device, host)))
+        numbers = (each[good] for each in (person, session, label, take * blocks + columns.blocks))
+        apart = "recording" in columns.names or columns.own_recordings or bool({"label", "recording"} & set(place))
+        return _TableSamples(frames, *numbers, people, sessions, labels, apart)
 
     def _write(
-        self, table: TableFile, original: ConvertedSource, samples: _TableSamples, mine: NDArray[np.int64], apart: bool
-    ) -> Iterator[SourceFile | Message]:
-        """Write the session whose rows are ``mine``; ``apart``: the file itself tells its recordings apart."""
+        self, table: TableFile, original: ConvertedSource, samples: _TableSamples, mine: NDArray[np.int64]
+    ) -> Iterator[SourceFile | str]:
+        """Write the session whose rows are ``mine``."""
         every = samples.frames
         assert every.host_ms is not None
         frames = Frames(every.values[mine], every.device_ms[mine], every.host_ms[mine])
-        label, take = samples.label[mine], samples.take[mine]
+        label = samples.label[mine]
         names = [self.pattern.label_of(text) for text in samples.labels]
         good = [self.pattern.names_gesture(n) and len(n) <= LONGEST_LABEL for n in names]
         named = np.array(good, dtype=bool)[label]
-        new = (np.diff(label) != 0) | (np.diff(take) != 0)
-        if not apart:
-            steps = np.diff(frames.device_ms)
+        new = (np.diff(label) != 0) | (np.diff(samples.take[mine]) != 0)
+        steps = np.diff(frames.device_ms)
+        if not samples.apart:
             new |= (steps < 0) | (steps > PAUSE_MS)
-        if self.pattern.recording_rows:
-            new |= self._ends_by_rows(new, samples.row[mine])
         runs = [0, *(np.flatnonzero(new) + 1).tolist(), len(mine)]
         # Without a clock, nothing is known of the time between recordings that a file tells apart.
-        timed = not (apart and self.pattern.row_rate_hz)
-        with_stream = not named.all() or (timed and self._go_on(frames.device_ms, new))
+        timed = not (samples.apart and self.pattern.row_rate_hz)
+        with_stream = not named.all() or (timed and self._go_on(steps, new))
         cuts = [
             LabelledSegment(names[label[a]], a, b, samples.labels[label[a]])
             for a, b in itertools.pairwise(runs)
             if named[a]
         ]
-        yield from self._short(table.display_name, [samples.row[mine[c.start : c.stop]] for c in cuts])
         key = samples.people[samples.person[mine[0]]], samples.sessions[samples.session[mine[0]]]
         taken = None if table.place is None else self._taken.setdefault(key, set())
         target = SessionTarget(self.folder / str(self._written), *key, self.layout)
         self._written += 1
         files = list(write_session(target, original, frames, cuts, with_stream=with_stream, taken=taken))
         yield from files
-        yield from self._merged(table.display_name, sorted({cut.label for cut in cuts}))
+        yield from self._merged(sorted({cut.label for cut in cuts}))
         if taken is not None:
             made = {f.source.name: f.origin for f in files if f.kind == RECORDINGS}
             self._origins.setdefault(key, []).append(original.table | {"recordings": made})
 
-    def _ends_by_rows(self, new: NDArray[np.bool_], row: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return after which rows (T − 1,) a recording ends by ``recording_rows``.
-
-        Args:
-            new: (T − 1,) whether another run of rows begins after the row; rows are counted from its beginning.
-            row: (T,) number of each row in the file.
-        """
-        begins = np.flatnonzero(np.append(True, new))
-        first = np.repeat(row[begins], np.diff([*begins.tolist(), len(row)]))
-        return np.asarray(np.diff((row - first) // self.pattern.recording_rows) != 0)
-
-    def _go_on(self, device_ms: NDArray[np.int64], new: NDArray[np.bool_]) -> bool:
+    def _go_on(self, steps: NDArray[np.int64], new: NDArray[np.bool_]) -> bool:
         """Return whether most runs of rows go on where the one before ends, so that they are parts of one stream.
 
         Args:
+            steps: (T − 1,) the time to the next row in ms.
             new: (T − 1,) whether another run begins after the row.
         """
-        steps = np.diff(device_ms)
         forward = steps[steps > 0]
         if not new.any() or not len(forward):
             return False
         gap_ms = max(self.layout.gap_ms, SLOW_FACTOR * float(np.median(forward)))
         return float(np.mean((steps[new] > 0) & (steps[new] <= gap_ms))) > 0.5
 
-    def _short(self, source: str, recordings: Sequence[NDArray[np.int64]]) -> Iterator[Message]:
-        """Yield a note about recordings, given as the numbers of their rows, with fewer than ``recording_rows``."""
-        count = sum(int(np.ptp(rows)) + 1 < self.pattern.recording_rows for rows in recordings)
-        if count:
-            n = self.pattern.recording_rows
-            template = "{n} of {of} recordings have fewer than {rows} rows: is recording_rows right?"
-            yield about_file(source, Message(template, n=count, of=len(recordings), rows=n))
-
-    def _merged(self, source: str, labels: Sequence[str]) -> Iterator[Message]:
+    def _merged(self, labels: Sequence[str]) -> Iterator[str]:
         """Yield a note for each label that becomes the same as another one, for want of characters in file names."""
         for label in labels:
             name = parse_name(recording_filename(label, 0, 0))
@@ -422,32 +414,28 @@ class TableImport:
             others = self._spellings.setdefault(plain_label(name.label), [label])
             if plain_label(label) not in map(plain_label, others):
                 others.append(label)
-                note = (
+                yield (
                     f"'{label}' and '{others[0]}' become one gesture, '{name.label}', as names of files have no "
                     '\\ / : * ? " < > | ( ), and no full stop at the end: if they are two, rename one in the source, '
                     "or give aliases in a --pattern"
                 )
-                yield about_file(source, note)
 
-    def _factor(self, columns: ImportedColumns, times: NDArray[np.float64]) -> tuple[float, str]:
+    def _factor(self, columns: ImportedColumns) -> tuple[float, str]:
         """Return the milliseconds per unit of the time column, and a note if the unit is stated nowhere."""
-        if columns.in_ms:
-            return 1.0, ""
-        if self.pattern.time_unit:
-            return UNITS[self.pattern.time_unit], ""
-        name = columns.names["time"]
+        if columns.in_ms or self.pattern.time_unit:
+            return 1.0 if columns.in_ms else UNITS[self.pattern.time_unit], ""
+        name, times = columns.names["time"], columns.numbers["time"]
         unit, stated = unit_of_time(name, times, self.layout.rate_hz)
         if stated:
             return UNITS[unit], ""
         # Steps of a clock that stands still say nothing about its unit.
         suggests = len(forward_steps(times)) > 0 and not rows_at_one_time(times[np.isfinite(times)])
-        why = f", as the rate of {self.layout.rate_hz:g} Hz suggests" if suggests else ""
         unit = unit if suggests else "ms"
         return UNITS[unit], Message(
             "column '{column}' is read as {read_as}{why}",
             column=name,
             read_as=unit if suggests else "milliseconds",
-            why=why,
+            why=f", as the rate of {self.layout.rate_hz:g} Hz suggests" if suggests else "",
             unit=unit,
         )
 
@@ -459,58 +447,3 @@ class TableImport:
             about.write_text(_json({"sources": sources}), encoding="utf-8", newline="\n")
             where = f"{subject}{f', session {session}' if session else ''}, {ORIGIN}"
             yield SourceFile(about, COMPANIONS, subject, session=session, origin=where)
-
-
-def _left_out(
-    table: TableFile, columns: ImportedColumns, good: NDArray[np.bool_], known: NDArray[np.bool_]
-) -> Iterator[Message]:
-    """Yield notes about the rows that are not used, with the line of the first of each kind."""
-
-    def first(bad: NDArray[np.bool_]) -> str:
-        return f"line {columns.lines[int(np.argmax(bad))]}" if len(columns.lines) and bad.any() else ""
-
-    ask = "; if such lines separate recordings, describe them with  between  in a pattern" if columns.text_lines else ""
-    for count, reason, where in (
-        (columns.malformed, columns.why_malformed, columns.first_malformed + ask),
-        (int(np.sum(~good)), "without a number in every column", first(~good)),
-        (int(np.sum(good & ~known)), "without a subject", first(good & ~known)),
-    ):
-        if count:
-            at = f" (the first: {where})" if where else ""
-            yield about_file(
-                table.display_name,
-                Message(
-                    "{n} row{more} {reason} left out{at}", n=count, more="s" if count > 1 else "", reason=reason, at=at
-                ),
-            )
-
-
-def _too_fine(table: TableFile, columns: ImportedColumns, device: NDArray[np.float64]) -> Iterator[Message]:
-    """Yield a note if the times in ``device`` (T,), in ms, would stand still since they are kept in whole ms."""
-    steps = forward_steps(device)
-    if len(steps) and float(np.median(steps)) < _FINEST_MS:
-        name, step = columns.names["time"], float(np.median(steps))
-        yield about_file(
-            table.display_name,
-            Message(
-                "by column '{column}', rows are {step:g} ms apart, but times are kept in whole ms: is its unit right?",
-                column=name,
-                step=step,
-            ),
-        )
-
-
-def _blocks(table: TableFile, columns: ImportedColumns) -> Iterator[Message]:
-    """Yield a note about the blocks of rows, if a table has several."""
-    count = int(columns.block_of_row.max(initial=0)) + 1
-    if count > 1:
-        join = ': between = "none" in the pattern joins them' if table.place is not None else ""
-        yield about_file(
-            table.display_name,
-            Message(
-                "{n} blocks of rows, separated by empty lines, comments or repeated column names, are recordings of "
-                "their own{join}",
-                n=count,
-                join=join,
-            ),
-        )

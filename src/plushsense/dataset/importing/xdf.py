@@ -282,7 +282,9 @@ class _Toy:
 
 
 def _find_toy(streams: Sequence[XdfStream], layout: Layout, choices: Mapping[str, str]) -> _Toy:
-    """Return the stream that fits the layout; ``choices`` are as in `read_xdf`.
+    """Return the stream that fits the layout.
+
+    ``choices`` are the name, or # and the number, of the ``stream``, and the labels of channels with other names.
 
     Raises:
         FileFormatError: if not exactly one stream fits.
@@ -435,7 +437,13 @@ def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Message]:
 
 
 def convert_xdf(path: Path, name: str, person: str | None, spec: ScanSpec, scan: SourceScan) -> tuple[str, str]:
-    """Convert an XDF file, and add its recordings and notes to ``scan``; return the person and the session."""
+    """Convert an XDF file, and add its recordings and notes to ``scan``; return the person and the session.
+
+    Raises:
+        ConfigError: for an unknown role in the columns of ``spec``.
+        FileFormatError: for a damaged file, one of an unknown person, or if not exactly one stream matches.
+        MissingExtraError: without pyxdf.
+    """
     subject, session = person_and_session(path, person)
     if spec.mapping is not None:
         subject = person
@@ -446,35 +454,20 @@ def convert_xdf(path: Path, name: str, person: str | None, spec: ScanSpec, scan:
             name=name,
             needs="person",
         )
+    accepted = (STREAM_ROLE, MARKERS_ROLE, DEVICE_MS, *scan.layout.names)
+    for role in set(spec.columns) - set(accepted):
+        raise ConfigError(f"--column {role}=…: in an XDF file, accepted are {', '.join(accepted)}.")
     target = SessionTarget(spec.new_folder("converted"), subject, session, scan.layout)
-    scan.add(read_xdf(path, name, target, scan.gestures, spec.columns, spec.limits))
+    scan.add(_recordings(path, name, target, scan.gestures, spec))
     return subject, session
 
 
-def read_xdf(
-    path: Path,
-    display_name: str,
-    target: SessionTarget,
-    gestures: GestureSet | None,
-    choices: Mapping[str, str],
-    limits: UnpackLimits,
+def _recordings(
+    path: Path, display_name: str, target: SessionTarget, gestures: GestureSet | None, spec: ScanSpec
 ) -> Iterator[SourceFile | str]:
-    """Write the recordings of an XDF file into the new folder of ``target``; yield the files, and warnings as text.
-
-    Args:
-        choices: the name, or # and the number, of the ``stream`` of the toy and of that of the ``markers``, and the
-            label of channels of the layout that have another name in the file.
-
-    Raises:
-        ConfigError: for an unknown key in ``choices``.
-        FileFormatError: for a damaged file, or if not exactly one stream matches.
-        MissingExtraError: without pyxdf.
-    """
-    layout, folder = target.layout, target.folder
-    accepted = (STREAM_ROLE, MARKERS_ROLE, DEVICE_MS, *layout.names)
-    for role in set(choices) - set(accepted):
-        raise ConfigError(f"--column {role}=…: in an XDF file, accepted are {', '.join(accepted)}.")
-    plain = uncompressed(path, folder / "uncompressed", limits)
+    """Write the recordings of an XDF file into the new folder of ``target``; yield the files, and notes as text."""
+    layout, folder, choices = target.layout, target.folder, spec.columns
+    plain = uncompressed(path, folder / "uncompressed", spec.limits)
     good, size = complete_chunks(plain, display_name)
     streams = _load(plain, good, display_name)
     if good < size:
