@@ -113,7 +113,6 @@ def test_new_codes_in_a_copy_without_metadata(cli: Cli, dataset: Dataset, tmp_pa
         (("publish", "DS", "OUT", *SAID, "--key", "DS/key"), "store it elsewhere"),
         (("publish", "DS", "OUT", *SAID, "--key", "bad.key"), "is not a key"),
         (("publish", "DS", "OUT", *SAID, "--pseudonyms", "--no-reidentification"), "Pseudonyms need a key"),
-        (("publish", "DS", "OUT", *SAID, "--no-reidentification", "--allow-columns", "hand"), "no column 'hand'"),
         (("publish", "DS", "taken", *SAID), "taken.zip' exists without its folder"),
     ],
 )

@@ -15,7 +15,6 @@ from plushsense.core.recorder_csv import Frames, recording_filename, write_recor
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.store import PersonInfo, write_people
 from plushsense.dataset.trimming import decide_trims
 from plushsense.windows.cut import WindowSpec, cut_windows
 
@@ -140,7 +139,3 @@ def test_stats(cli: Cli, waves: Path) -> None:
     after = cli("info", waves, "--durations", "--json").json["durations"][0]
     assert after["after_s"]["mean"] == pytest.approx(3.5, abs=0.06)
     assert "After trimming" in cli("info", waves, "--durations").out
-    assert cli("info", waves, "--by", "gender").status == 2
-    write_people(waves, [PersonInfo("P1", "child", "f"), PersonInfo("P2", "adult", "f")])
-    by = cli("info", waves, "--by", "age_group", "--json").json["durations"]
-    assert [(d["gesture"], d["group"]) for d in by][:3] == [("Fast", "adult"), ("Fast", "child"), ("Fast", "not said")]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
-from plushsense.cli.settings import listed, report_stages
+from plushsense.cli.settings import report_stages
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 
@@ -27,7 +27,7 @@ def _check(args: argparse.Namespace) -> int:
 
     if args.dataset:
         raise ConfigError("Give either DATASET OUT, or --check PACKAGE, not both.")
-    checked = validate_package(args.check, thorough=args.thorough)
+    checked = validate_package(args.check)
     _print_problems(args, checked.to_dict()["problems"])
     verdict = "valid" if checked.valid else f"not valid: {len(checked.problems)} problems"
     emit(args, {"package": args.check, **checked.to_dict()}, f"{args.check}: {verdict}")
@@ -40,10 +40,9 @@ def _publish(args: argparse.Namespace) -> int:
     if not args.dataset or not args.out:
         raise ConfigError("Publishing needs DATASET and OUT, or --check PACKAGE.  See  plushsense publish --help")
     spec = PublishSpec(
-        **options(args, "licence", "contact", "consent", "save", "key", "pseudonyms", "seed", "thorough"),
+        **options(args, "licence", "contact", "consent", "save", "key", "pseudonyms"),
         streams=not args.no_streams,
         excluded=args.allow_excluded,
-        columns=tuple(listed(args.allow_columns)),
         reidentification=not args.no_reidentification,
     )
     if args.without_metadata:

@@ -314,14 +314,13 @@ def verdict(results: ReidentificationResult) -> str:
     return " ".join(sentences.splitlines())
 
 
-def report(results: ReidentificationResult, command: str) -> str:
-    """Return the whole report in Markdown; ``command`` is the command line that it shows for repeating the test."""
+def report(results: ReidentificationResult) -> str:
+    """Return the whole report in Markdown."""
     trial = results.find("recordings", "everything")
     by_person = None if trial is None else sorted(trial.by_person.items(), key=lambda item: (-item[1], item[0]))
     return _fill(
         "reidentification.md.j2",
         found=results,
-        command=command,
         verdict=verdict(results),
         by_person=by_person,
         designs=DESIGNS,

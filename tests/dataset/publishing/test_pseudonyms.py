@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -94,8 +95,7 @@ def test_an_old_code_anywhere_stops_it_and_nothing_is_left(
         dataset = _opened_again(dataset)
     else:
         table = dataset.path / "subjects.csv"
-        table.write_text(table.read_text().replace("left", "as P2"))
-        spec = replace(spec, columns=("hand",))
+        table.write_text(re.sub("^(P1,)[^,]*", r"\1as P2", table.read_text(), flags=re.MULTILINE))
     with pytest.raises(DatasetError, match=r"would still hold 'P1|p-1|P2'"):
         share_copy(dataset, tmp_path / "OUT", spec)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["DS", "secret"]

@@ -38,7 +38,6 @@ from plushsense.dataset.publishing.keys import KEPT, PublicationKey
 from plushsense.dataset.publishing.texts import is_misread, label_prefix, public_label
 from plushsense.dataset.store import (
     HEAD,
-    PEOPLE,
     RECORDINGS,
     STREAMS,
     Dataset,
@@ -108,9 +107,6 @@ def shift_of(subject: str, firsts: list[int], device: bool, key: bytes) -> Shift
     return Shift(min(near, default=0), YEAR_2000_MS + drawn, device)
 
 
-PUBLIC_COLUMNS = ("age_group", "gender")
-
-
 @dataclass(frozen=True)
 class ContentsSpec:
     """What to publish of a data set.
@@ -118,14 +114,12 @@ class ContentsSpec:
     Attributes:
         streams: whether to include the streams of whole sessions.
         excluded: whether to include excluded recordings, marked as such.
-        columns: columns of the people's table besides `PUBLIC_COLUMNS`.
         key: the key of the time shifts and, with ``pseudonyms``, of the new codes; a new one by default.
         pseudonyms: whether people get the codes of ``key`` instead of their own.
     """
 
     streams: bool = True
     excluded: bool = False
-    columns: tuple[str, ...] = ()
     key: PublicationKey = field(default_factory=PublicationKey)
     pseudonyms: bool = False
 
@@ -342,24 +336,14 @@ class ContentsWriter:
 
     def _write_people(self) -> dict[str, PersonInfo]:
         known = read_people(self.source.path)
-        columns = {c for p in known.values() for c in p.more}
-        for column in self.spec.columns:
-            if column not in columns:
-                raise DatasetError(
-                    "{people} has no column '{column}' to publish; besides {public_columns} it has {columns}.",
-                    people=PEOPLE,
-                    column=column,
-                    public_columns=", ".join(PUBLIC_COLUMNS),
-                    columns=", ".join(sorted(columns)) or "none",
-                )
         people = {
-            public: PersonInfo(public, p.age_group, p.gender, "", {c: p.more.get(c, "") for c in self.spec.columns})
+            public: PersonInfo(public, p.age_group, p.gender)
             for code, public in self.codes.items()
             if (p := known.get(code)) is not None
         }
         if people:
             write_people(self.folder, people.values())
-        left_out = len(columns - set(self.spec.columns)) + any(p.consent for p in known.values())
+        left_out = len({c for p in known.values() for c in p.more}) + any(p.consent for p in known.values())
         if left_out:
             # Give only the number, since even the name of a column may be private.
             self.notes.append(Message("Left out: {n:column} of the people's table.", n=left_out))
@@ -389,57 +373,31 @@ class ContentsWriter:
             (self.folder / MARKS).write_text("".join(map(mark_line, marks)), encoding="utf-8", newline="\n")
 
     def _note_changes(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
-        out = [r for r in self.source.recordings if r.excluded]
-        if out and not self.spec.excluded and not self.labelled:
-            template = "Left out: {n:excluded recording}."
-            if self.streams:
-                template = "Left out: {n:excluded recording}. Their rows are still in the session's stream."
-            self.notes.append(Message(template, n=len(out)))
-        elif out:
-            self.notes.append(Message("In the package, but marked as excluded: {n:recording}.", n=len(out)))
-        if self.source.streams and not self.streams:
-            n = len(self.source.streams)
-            self.notes.append(Message("Left out: {n:session stream}.", n=n))
+        excluded = sum(r.excluded for r in self.source.recordings)
+        marked = excluded if self.spec.excluded or self.labelled else 0
+        renamed = 0 if self.spec.pseudonyms else sum(code != public for code, public in self.codes.items())
         trimmed = sum((r.start, r.stop) != (0, r.rows) for r in published.recordings)
-        if trimmed:
-            self.notes.append(
-                Message("Trimmed: {n:recording}; the files hold all rows, start and stop say which remain.", n=trimmed)
-            )
         relabelled = sum(r.gesture != r.recorded for r in published.recordings)
-        if relabelled:
-            self.notes.append(
-                Message(
-                    "Relabelled: {n:recording}; the files are named after the gesture that was asked for, the tables "
-                    "state the one that was made.",
-                    n=relabelled,
-                )
-            )
-        renamed = [code for code, public in self.codes.items() if code != public]
-        if renamed and not self.spec.pseudonyms:
-            self.notes.append(
-                Message(
-                    "Renamed: {n:subject code} that looked like a number or nothing, now with a P in front.",
-                    n=len(renamed),
-                )
-            )
+        lost = sum(origin[r.id].stream_row >= 0 and r.stream_row < 0 for r in published.recordings)
         odd = sorted(r for r in {r.gesture for r in self.kept} if self.label(r) != r)
-        if odd:
-            listed = ", ".join(f"'{label}' is now '{self.label(label)}'" for label in odd)
-            self.notes.append(
-                Message(
-                    "Renamed: gestures that other programs read as a number, a date or no value; {listed}.",
-                    listed=listed,
-                    n=len(odd),
-                )
-            )
-        if self.streams and published.recordings and not self.labelled:
-            lost = sum(origin[r.id].stream_row >= 0 and r.stream_row < 0 for r in published.recordings)
-            if lost:
-                self.notes.append(Message("No longer found in their stream: {n:recording}.", n=lost))
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}{'' if n == 1 else 's'}"
+        left_out = "Left out: {n:excluded recording}."
+        if self.streams:
+            left_out = "Left out: {n:excluded recording}. Their rows are still in the session's stream."
+        notes = {
+            left_out: excluded - marked,
+            "In the package, but marked as excluded: {n:recording}.": marked,
+            "Left out: {n:session stream}.": 0 if self.streams else len(self.source.streams),
+            "Trimmed: {n:recording}; the files hold all rows, start and stop say which remain.": trimmed,
+            "Relabelled: {n:recording}; the files are named after the gesture that was asked for, the tables "
+            "state the one that was made.": relabelled,
+            "Renamed: {n:subject code} that looked like a number or nothing, now with a P in front.": renamed,
+            "Renamed: gestures that other programs read as a number, a date or no value; {listed}.": len(odd),
+            "No longer found in their stream: {n:recording}.": lost if self.streams and not self.labelled else 0,
+        }
+        listed = ", ".join(f"'{label}' is now '{self.label(label)}'" for label in odd)
+        self.notes += [
+            Message(note, n=n, **({"listed": listed} if "{listed}" in note else {})) for note, n in notes.items() if n
+        ]
 
 
 def _folder_of(file: str) -> str:
