@@ -19,19 +19,18 @@ _LINES = 20
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.dataset.trimming import decide_trims
+    from plushsense.dataset.trimming import TrimDecisions, decide_trims
 
     if args.plot:
         from plushsense.reports.quality_figures import check_picture_path
 
         check_picture_path(Path(args.plot))
-    result = decide_trims(
-        args.dataset,
+    decisions = TrimDecisions(
         **options(args, "only", "accept", "undo", "offset", "who", "why"),
         above=args.accept_above,
         keep=[(identity, *seconds_between("--set", text)) for identity, text in args.set],
-        progress=ProgressReporter("reading"),
     )
+    result = decide_trims(args.dataset, decisions, ProgressReporter("reading"))
     drawn: list[Path] = []
     if args.plot:
         from plushsense.reports.quality_figures import save_trims

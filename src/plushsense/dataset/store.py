@@ -36,7 +36,7 @@ from plushsense.core.recorder_csv import Frames, ReadResult, read_bytes, read_re
 from plushsense.core.sentences import plural
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About, HeadFile
-from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, locked, read_marks
+from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, apply_mark, locked, read_marks
 from plushsense.recording.takes import duration_s
 
 FORMAT_VERSION = 1
@@ -422,14 +422,23 @@ class Dataset:
                 pieces = [rest for piece in pieces for rest in piece.outside(first, last)]
         return pieces
 
-    def append_marks(self, marks: Iterable[Mark]) -> None:
-        """Append marks, unless a person was removed since the data set was opened; this object is not updated.
+    def append_marks(self, marks: Iterable[Mark]) -> tuple[Mark, ...]:
+        """Append those of ``marks``, in their order, that change something, and return them.
+
+        This object is not updated: open the data set again.
 
         Raises:
-            ForgottenError: like `Generation.check`.
+            ForgottenError: if a person was removed since the data set was opened, see `Generation.check`.
             DatasetError: like `plushsense.dataset.marks.append_marks`.
         """
-        append_marks(self.path, marks, self.generation.check)
+        standing, new = dict(read_marks(self.path)), []
+        for mark in marks:
+            before = standing.get(mark.recording, MarkState())
+            standing[mark.recording] = apply_mark(before, mark)
+            if standing[mark.recording] != before:
+                new.append(mark)
+        append_marks(self.path, new, self.generation.check)
+        return tuple(new)
 
     def read(self, recording: RecordingInfo) -> Frames:
         """Read the rows of one recording that remain after trimming."""

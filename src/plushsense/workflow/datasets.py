@@ -142,10 +142,10 @@ def decide(
         checking.parse_acceptance(acceptance)
     if accept:
         marks += checking.acceptances(check_dataset(dataset, limits=limits), accept, who=name, why=why)
-    if marks:
-        dataset.append_marks(marks)
+    marked = dataset.append_marks(marks)
+    if marked:
         dataset = as_dataset(dataset.path)
-    return check_dataset(dataset, only=only, limits=limits, progress=progress), len(marks)
+    return check_dataset(dataset, only=only, limits=limits, progress=progress), len(marked)
 
 
 @dataclass(frozen=True)
