@@ -278,7 +278,7 @@ def test_every_recording_and_the_first_rows_of_streams_are_loaded(package: Publi
     found = check_folder(root)
     assert found.problems == []
     said = next(v.looked_at for v in found.validators if v.validator == "croissant")
-    assert "2000 records of stream-samples" in said
+    assert "3000 records of stream-samples" in said
     assert "1260 records of samples" in said
 
 

@@ -21,7 +21,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.core.sentences import Message
 from plushsense.dataset.about import Contact
-from plushsense.dataset.index import open_dataset
+from plushsense.dataset.index import open_dataset, write_index_files
 from plushsense.dataset.publishing.checking import EXTRA, StageProgress, ValidationResult, check_folder
 from plushsense.dataset.publishing.contents import (
     ContentsSpec,
@@ -300,6 +300,8 @@ def copy_dataset(dataset: Dataset, out: Path, spec: ContentsSpec, progress: Stag
         if spec.pseudonyms:
             refuse_traces(work, person_codes(dataset))
         files = len(list_package_files(work))
+        # Without an index, opening the copy would write one, and leave the file of its lock there.
+        write_index_files(contents.dataset)
     return CopyResult(open_dataset(out), files, contents.notes)
 
 
