@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,10 +26,10 @@ def run(args: argparse.Namespace) -> int:
 
     dataset = open_dataset(args.path)
     summary = dataset.summary()
-    rows = [(g["label"], g["affect"], g["recordings"], g["subjects"], g["median_s"]) for g in summary["gestures"]]
+    rows = [astuple(counts) for counts in dataset.gesture_counts()]
     text = [
         repr(dataset),
-        f"layout {summary['layout']}, {plural(summary['located_in_stream'], 'recording')} located in a stream, "
+        f"layout {summary['layout']}, {summary['located_in_stream']} recordings located in a stream, "
         f"{summary['with_warnings']} with warnings, {summary['excluded']} excluded",
         f"hash {summary['hash']}",
         "",

@@ -61,19 +61,12 @@ def _print(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> Non
     }
     # After a decision only the changed recordings are listed.
     decided = _decides(args)
-    rows = [
-        (
-            r["recording"],
-            r["rows"],
-            f"{r['start_s']:.2f}",
-            f"{r['stop_s']:.2f}",
-            f"{r['confidence']:.2f}",
-            r["state"],
-            r["note"],
-        )
-        for r in result["recordings"]
-        if not decided or r["recording"] in done.changed
-    ]
+    rows = []
+    for t in done.trims:
+        if not decided or t.recording.id in done.changed:
+            start, stop = (f"{t.seconds[row]:.2f}" for row in t.current_rows(args.offset))
+            surest = f"{t.suggestion.onset_confidence:.2f}"
+            rows.append((t.recording.id, t.recording.rows, start, stop, surest, t.state, t.suggestion.why))
     if not args.json and (args.accept or args.accept_above is not None):
         below = " or below the confidence" if args.accept_above else ""
         say(

@@ -12,7 +12,6 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +65,7 @@ class Trim:
         stop = self.recording.rows if self.mark_state.stop < 0 else min(self.mark_state.stop, self.recording.rows)
         return min(self.mark_state.start, stop), stop
 
-    def to_dict(self, offset: bool = False) -> dict[str, Any]:
+    def to_dict(self, offset: bool = False) -> dict[str, object]:
         """Return plain values for JSON: `current_rows` and the suggestion."""
         start, stop = self.current_rows(offset)
         s = self.suggestion

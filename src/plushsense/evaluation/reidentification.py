@@ -84,7 +84,7 @@ class ReidentificationTrial:
         """People whose top-1 and precision are both at least `CLEARLY`."""
         return [p for p, share in self.by_person.items() if min(share, self.precision[p]) >= CLEARLY]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return dict(vars(self))
 
@@ -121,7 +121,7 @@ class ReidentificationResult:
             self, trials=tuple(trials), gestures_of_one_person=tuple(map(label, self.gestures_of_one_person))
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         lists = {
             "trials": [t.to_dict() for t in self.trials],

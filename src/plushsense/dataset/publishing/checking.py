@@ -99,7 +99,7 @@ class ValidationResult:
         """Whether no validator found a problem."""
         return not self.problems
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
         validators, problems = ([vars(each) for each in listed] for listed in (self.validators, self.problems))
         return {"valid": self.valid, "validators": validators, "problems": problems}

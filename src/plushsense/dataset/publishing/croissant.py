@@ -38,7 +38,7 @@ FILE_FIELD = "file"
 _TYPES = {INTEGER: "cr:Int64", NUMBER: "cr:Float64", TEXT: "sc:Text", YES_NO: "sc:Boolean"}
 
 
-def croissant(d: Description) -> dict[str, Any]:
+def croissant(d: Description) -> dict[str, object]:
     """Return the metadata as JSON-LD; ``d.files`` must contain the tables, whose checksums are included."""
     people = [
         {"@type": "sc:Person", "name": c.name}
@@ -46,7 +46,7 @@ def croissant(d: Description) -> dict[str, Any]:
         | ({"description": c.affiliation} if c.affiliation else {})
         for c in d.creators
     ]
-    document: dict[str, Any] = {
+    document: dict[str, object] = {
         # The context in full instead of its address, so that readers need not fetch it.
         "@context": json.loads(resources.files("plushsense.dataset.publishing").joinpath(CONTEXT).read_text("utf-8")),
         "@type": "sc:Dataset",

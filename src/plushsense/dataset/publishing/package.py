@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from plushsense.core.errors import DatasetError, need
 from plushsense.core.files import new_folder
@@ -68,7 +67,7 @@ class Reidentification:
 
     report: str
     short: str
-    figures: dict[str, Any]
+    figures: dict[str, object]
 
 
 @dataclass
@@ -89,7 +88,7 @@ class PublishResult:
         """Whether every validator accepts the package."""
         return self.checked.valid
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
         d = self.description
         return {
@@ -274,7 +273,7 @@ class CopyResult:
     files: int
     notes: tuple[Message, ...]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
         return {
             "out": str(self.dataset.path),

@@ -146,7 +146,7 @@ class CheckReport:
             "accepted": dict(Counter(f.check for f in self.findings if f.accepted)),
         }
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
         return {
             "ok": self.ok,
