@@ -127,13 +127,3 @@ def test_refusals_are_sentences(
     assert said in ran.err
     assert ran.err.count("\n") == 1
     assert not (tmp_path / "OUT").exists()
-
-
-def test_without_scikit_learn_the_install_command_is_told(
-    cli: Cli, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
-    monkeypatch.setitem(sys.modules, "sklearn", None)
-    ran = cli("publish", dataset.path, tmp_path / "out", *SAID)
-    assert ran.status == 2
-    assert "pip install 'plushsense[baselines]'" in ran.err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from plushsense.core.recorder_csv import Frames, recording_filename, write_recor
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.trimming import TrimDecisions, decide_trims
 from plushsense.windows.cut import WindowSpec, cut_windows
 
 pytestmark = pytest.mark.apart("trainings")
@@ -114,13 +112,6 @@ def test_a_place_that_cannot_be_drawn_to_is_refused_before_the_first_mark(cli: C
     assert (ran.status, ran.err.count("\n")) == (2, 1)
     assert "is a file" in ran.err
     assert not (waves / MARKS).exists()
-
-
-def test_from_python(waves: Path) -> None:
-    done = decide_trims(waves, TrimDecisions(only="P1/*", above=0.5, who="K"))
-    assert (len(done.changed), done.states) == (4, {"accepted": 4})
-    assert decide_trims(waves, TrimDecisions(undo=["P1/*"], who="K")).states == {"suggested": 12}
-    assert {json.loads(line)["who"] for line in (waves / MARKS).read_text().splitlines()} == {"K"}
 
 
 def test_plot(cli: Cli, waves: Path, tmp_path: Path) -> None:

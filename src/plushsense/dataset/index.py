@@ -145,21 +145,14 @@ def _rebuilt(folder: Path, head: DatasetHead) -> Dataset:
     return built.dataset
 
 
-def _digests(recordings: Iterable[RecordingInfo], streams: Iterable[StreamInfo]) -> dict[str, str]:
-    return {r.file: r.sha256 for r in recordings} | {s.file: s.sha256 for s in streams}
-
-
 def _refuse_changed(folder: Path, now: Dataset) -> None:
     """Raise DatasetError if a raw file is not the one that the index on disk describes."""
-    try:
-        recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
-        streams = read_index(folder / STREAMS_INDEX, StreamInfo)
-    except DatasetError:
+    before = _read_index(folder)
+    if before is None:
         return
-    before = _digests(recordings, streams)
-    files = _digests(now.recordings, now.streams)
-    changed = sorted(file for file, sha256 in files.items() if before.get(file, sha256) != sha256)
-    if changed:
+    known = {info.file: info.sha256 for infos in before for info in infos}
+    files = {info.file: info.sha256 for infos in (now.recordings, now.streams) for info in infos}
+    if changed := sorted(file for file, sha256 in files.items() if known.get(file, sha256) != sha256):
         raise DatasetError(
             "{n} raw file{more} in '{folder}' changed since the import ('{file}'), but raw files are never "
             "rewritten: restore them, or delete {stamp} there to go on with what they hold now.",
@@ -171,15 +164,20 @@ def _refuse_changed(folder: Path, now: Dataset) -> None:
         )
 
 
-def _indexed(folder: Path, head: DatasetHead, generation: Generation, files: Iterable[str]) -> Dataset | None:
-    """Return the data set as its index on disk describes it; None if that is damaged, or not of the raw ``files``."""
+def _read_index(folder: Path) -> tuple[list[RecordingInfo], list[StreamInfo]] | None:
+    """Return the rows of the index files; None if they are damaged."""
     try:
-        recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
-        streams = read_index(folder / STREAMS_INDEX, StreamInfo)
+        return read_index(folder / RECORDINGS_INDEX, RecordingInfo), read_index(folder / STREAMS_INDEX, StreamInfo)
     except DatasetError:
         return None
-    same = {r.file for r in recordings} | {s.file for s in streams} == set(files)
-    return Dataset(folder, head, recordings, streams, generation) if same else None
+
+
+def _indexed(folder: Path, head: DatasetHead, generation: Generation, files: Iterable[str]) -> Dataset | None:
+    """Return the data set as its index on disk describes it; None if that is damaged, or not of the raw ``files``."""
+    index = _read_index(folder)
+    if index is None or {info.file for infos in index for info in infos} != set(files):
+        return None
+    return Dataset(folder, head, *index, generation)
 
 
 def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> IndexBuild:

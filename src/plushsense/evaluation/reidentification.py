@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -84,10 +84,6 @@ class ReidentificationTrial:
         """People whose top-1 and precision are both at least `CLEARLY`."""
         return [p for p, share in self.by_person.items() if min(share, self.precision[p]) >= CLEARLY]
 
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values, ready for JSON."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True)
 class ReidentificationResult:
@@ -123,11 +119,7 @@ class ReidentificationResult:
 
     def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
-        lists = {
-            "trials": [t.to_dict() for t in self.trials],
-            "gestures_of_one_person": list(self.gestures_of_one_person),
-        }
-        return {**vars(self), **lists}
+        return asdict(self)
 
 
 def reidentify(

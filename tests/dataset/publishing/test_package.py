@@ -111,22 +111,6 @@ def test_every_value_comes_back_and_times_keep_their_distances(source: Dataset, 
     assert validate_package(package.folder).problems == []
 
 
-def test_mlcroissant_alone_loads_every_integer(source: Dataset, package: PublishResult) -> None:
-    import mlcroissant
-
-    loaded = mlcroissant.Dataset(str(package.folder / "croissant.json"))
-    rows: dict[str, list[list[int]]] = {}
-    for record in loaded.records("samples"):
-        key = record["samples/file"].decode()
-        rows.setdefault(key, []).append([int(record[f"samples/{c}"]) for c in ("device_ms", "x", "y", "z")])
-    expected = sorted(
-        np.column_stack([f.device_ms, f.values]).tolist()
-        for f in (read_recording(source.path / r.file, source.layout).frames for r in source.used)
-    )
-    assert sorted(rows.values()) == expected
-    assert loaded.metadata.version == "1.0.0"
-
-
 def test_the_tables_say_what_there_is(package: PublishResult) -> None:
     with (package.folder / "recordings.csv").open(encoding="utf-8", newline="") as file:
         recordings = list(csv.DictReader(file))

@@ -11,6 +11,7 @@ import hmac
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,8 @@ LATEST_MS = 1_262_304_000_000
 _FAR_MS = 9 * 366 * 86_400_000
 # A 32-bit clock in ms wraps after 49 days; larger values are dates.
 WALL_CLOCK_MS = 2**32
+# What of a recording must be the same in the package.
+_facts_of = attrgetter("gesture", "rows", "first_row", "start", "stop", "excluded")
 
 
 @dataclass(frozen=True)
@@ -192,21 +195,10 @@ class ContentsWriter:
         built = build_index(self.folder, self.head)
         published = {r.id: r for r in built.dataset.recordings}
         origin = {ids[r.id]: replace(r, gesture=self.label(r.gesture)) for r in self.kept}
-        if built.unreadable or published.keys() != origin.keys():
-            odd = next(iter([*built.unreadable, *(published.keys() ^ origin.keys())]))
-            raise DatasetError("The package would differ from the data set in '{name}'. Please report it.", name=odd)
-        for identity, before in origin.items():
-            after = published[identity]
-            for key in ("gesture", "rows", "first_row", "start", "stop", "excluded"):
-                if getattr(before, key) != getattr(after, key):
-                    raise DatasetError(
-                        "'{name}' would be published with another {key}: {later!r} instead of {earlier!r}. "
-                        "Please report it.",
-                        name=identity,
-                        key=key,
-                        later=getattr(after, key),
-                        earlier=getattr(before, key),
-                    )
+        odd = [*built.unreadable, *(published.keys() ^ origin.keys())]
+        odd += [name for name, r in origin.items() if name in published and _facts_of(r) != _facts_of(published[name])]
+        if odd:
+            raise DatasetError("The package would differ from the data set in '{name}'. Please report it.", name=odd[0])
         self._note_changes(built.dataset, origin)
         return PackageContents(built.dataset, people, origin, tuple(self.notes))
 
