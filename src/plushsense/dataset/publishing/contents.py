@@ -30,7 +30,7 @@ from plushsense.core.recorder_csv import (
     read_stream,
     recording_filename,
 )
-from plushsense.core.sentences import Message
+from plushsense.core.sentences import Message, join_names
 from plushsense.dataset.files import walk_files
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
 from plushsense.dataset.marks import MARKS, PRACTICE, Mark, MarkState, mark_line, read_marks
@@ -386,7 +386,7 @@ class ContentsWriter:
             "Renamed: gestures that other programs read as a number, a date or no value; {listed}.": len(odd),
             "No longer found in their stream: {n:recording}.": lost if self.streams and not self.labelled else 0,
         }
-        listed = ", ".join(f"'{label}' is now '{self.label(label)}'" for label in odd)
+        listed = join_names(f"'{label}' is now '{self.label(label)}'" for label in odd)
         self.notes += [
             Message(note, n=n, **({"listed": listed} if "{listed}" in note else {})) for note, n in notes.items() if n
         ]
