@@ -141,23 +141,10 @@ def test_a_refusal_is_one_sentence_and_marks_nothing(words: list[str], said: str
     assert not (folder / "marks.jsonl").exists()
 
 
-def test_a_misspelt_recording_is_answered_with_the_nearest(cli: Cli, folder: Path) -> None:
-    name = ids(folder)[0]
-    ran = cli("check", folder, "--exclude", name[:-1], "--why", "x")
-    assert ran.status == 2
-    assert f"Did you mean '{name}'" in ran.err
-
-
 def test_one_wrong_pattern_leaves_no_half_of_a_decision(cli: Cli, folder: Path) -> None:
     ran = cli("check", folder, "--exclude", ids(folder)[0], "--accept", "clock-reset:P4/*", "--why", "x")
     assert ran.status == 2
     assert not (folder / "marks.jsonl").exists()
-
-
-def test_only_some_checks_and_other_limits(cli: Cli, folder: Path) -> None:
-    ran = cli("check", folder, "--only", "duration,gaps", "--limit", "duration=0.05", "--json")
-    assert ran.status == 0, "the reset was not asked for"
-    assert set(ran.json["counts"]["by_check"]) == {"duration"}
 
 
 def test_the_page_replaces_its_own_kind_only(cli: Cli, folder: Path, tmp_path: Path) -> None:

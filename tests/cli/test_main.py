@@ -289,7 +289,7 @@ def test_links_to_themselves_and_pipes_are_refused(cli: Cli, recordings: Path, t
     os.mkfifo(tmp_path / "pipe")
     for words, said in (
         (("import", recordings, tmp_path / "loop", "--layout", "accel-3"), "link"),
-        (("backup", "--restore", tmp_path / "pipe", tmp_path / "DS"), "is no file: give a backup"),
+        (("backup", "--restore", tmp_path / "pipe", tmp_path / "DS"), "There is no backup"),
         (("export", tmp_path / "pipe", tmp_path / "C"), "no regular file"),
         (("train", tmp_path, "--config", tmp_path / "pipe"), "no regular file"),
     ):

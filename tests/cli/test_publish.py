@@ -113,7 +113,6 @@ def test_new_codes_in_a_copy_without_metadata(cli: Cli, dataset: Dataset, tmp_pa
         (("publish", "DS", "OUT", *SAID, "--key", "DS/key"), "store it elsewhere"),
         (("publish", "DS", "OUT", *SAID, "--key", "bad.key"), "is not a key"),
         (("publish", "DS", "OUT", *SAID, "--pseudonyms", "--no-reidentification"), "Pseudonyms need a key"),
-        (("publish", "DS", "OUT", *SAID, "--no-reidentification", "--allow-columns", "hand"), "no column 'hand'"),
         (("publish", "DS", "taken", *SAID), "taken.zip' exists without its folder"),
     ],
 )
@@ -128,13 +127,3 @@ def test_refusals_are_sentences(
     assert said in ran.err
     assert ran.err.count("\n") == 1
     assert not (tmp_path / "OUT").exists()
-
-
-def test_without_scikit_learn_the_install_command_is_told(
-    cli: Cli, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
-    monkeypatch.setitem(sys.modules, "sklearn", None)
-    ran = cli("publish", dataset.path, tmp_path / "out", *SAID)
-    assert ran.status == 2
-    assert "pip install 'plushsense[baselines]'" in ran.err

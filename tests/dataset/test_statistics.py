@@ -1,18 +1,16 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from plushsense.core.errors import DatasetError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.quality.measurements import summarize
-from plushsense.dataset.statistics import SummaryStatistics, channel_table, duration_bands, duration_table
-from plushsense.dataset.store import Dataset, PersonInfo, write_people
+from plushsense.dataset.statistics import SummaryStatistics, duration_bands, duration_table
+from plushsense.dataset.store import Dataset
 
 ACCEL = load_layout("accel-3")
 ROWS = {("P1", "Wave"): [100, 200, 300], ("P2", "Wave"): [400], ("P2", "Tap"): [50]}
@@ -52,36 +50,6 @@ def test_durations_by_gesture_before_and_after_trimming(dataset: Dataset) -> Non
     assert (wave.trimmed, wave.before_rows.max, wave.after_rows.max) == (1, 400.0, 300.0)
     append_marks(dataset.path, [Mark(longest.id, "exclude", "K")])
     assert duration_table(open_dataset(dataset.path))[1].recordings == 3
-
-
-def test_durations_by_what_is_known_of_the_people(dataset: Dataset) -> None:
-    with pytest.raises(DatasetError, match=r"no subjects.csv"):
-        duration_table(dataset, "gender")
-    write_people(dataset.path, [PersonInfo("P1", "child", "f", more={"hand": "left"}), PersonInfo("P9")])
-    assert [(d.gesture, d.group, d.recordings) for d in duration_table(dataset, "age_group")] == [
-        ("Tap", "not said", 1),
-        ("Wave", "child", 3),
-        ("Wave", "not said", 1),
-    ]
-    assert duration_table(dataset, "Hand")[1].group == "left"
-    assert [d.group for d in duration_table(dataset, "subject")] == ["P2", "P1", "P2"]
-    with pytest.raises(DatasetError, match=r"no column 'gendre'.*Did you mean 'gender'"):
-        duration_table(dataset, "gendre")
-
-
-def test_nobody_is_a_group_of_its_own(dataset: Dataset) -> None:
-    resting = [replace(r, subject="none") if r.gesture == "Tap" else r for r in dataset.recordings]
-    write_people(dataset.path, [PersonInfo("P1", gender="f")])
-    tap = duration_table(Dataset(dataset.path, dataset.head, resting, []), "gender")[0]
-    assert (tap.group, tap.people) == ("nobody", 0)
-
-
-def test_channels_by_gesture(dataset: Dataset) -> None:
-    table = {(c.gesture, c.channel): c for c in channel_table(dataset)}
-    assert (table["Tap", "x"].mean, table["Tap", "y"].sd, table["Tap", "z"].rows) == (24.5, 0.0, 50)
-    x = np.concatenate([np.arange(n) for n in (100, 200, 300, 400)])
-    assert table["Wave", "x"].mean == pytest.approx(x.mean())
-    assert table["Wave", "x"].sd == pytest.approx(x.std())
 
 
 def test_the_band_of_the_paper_around_the_mean(dataset: Dataset) -> None:

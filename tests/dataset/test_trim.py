@@ -19,12 +19,13 @@ from plushsense.dataset.marks import MARKS, Mark, append_marks
 from plushsense.dataset.store import Dataset
 from plushsense.dataset.trimming import (
     Trim,
+    TrimDecisions,
     accept_suggestions,
+    decide_trims,
     find_recordings,
     kept_rows,
     set_rows,
     suggest_trims,
-    undo_trims,
 )
 
 ACCEL = load_layout("accel-3")
@@ -123,8 +124,8 @@ def test_setting_what_stands_adds_nothing_and_undo_brings_the_suggestion_back(da
     standing = next(t for t in suggest_trims(dataset) if t.recording.id == first.recording.id)
     assert not set_rows(dataset, standing, *kept_rows(standing, 0.8, None), "K")
     assert _lines(dataset) == 1
-    assert undo_trims(dataset, find_recordings(dataset, "P1/*"), "K") == (first.recording.id,)
-    assert undo_trims(dataset, find_recordings(dataset, "P1/*"), "K") == ()
+    undo = TrimDecisions(undo=["P1/*"], who="K")
+    assert [decide_trims(dataset, undo).undone for _ in range(2)] == [(first.recording.id,), ()]
     assert _lines(dataset) == 2
     assert _states(dataset) == ["none", "suggested", "suggested"] * 2
     assert open_dataset(dataset.path).hash == dataset.hash

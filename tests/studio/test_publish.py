@@ -13,7 +13,6 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.publishing.checking import VALIDATORS
-from plushsense.dataset.store import PEOPLE
 from plushsense.studio import tasks
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.words import LANGUAGES, Words
@@ -39,10 +38,8 @@ def run_task(task: Any, **spec: Any) -> tuple[dict[str, Any], list[dict[str, Any
     return result, [json.loads(line) for line in out.getvalue().splitlines()]
 
 
-def test_columns_and_a_broken_data_set(few: Path) -> None:
+def test_a_broken_data_set(few: Path) -> None:
     folder = few / "datasets" / "virtual"
-    (folder / PEOPLE).write_text("subject,age_group,gender,consent,handedness\nP01,10-12,f,A1,left\n", "utf-8")
-    assert DatasetFacts.of(folder).columns == ("handedness",)
     (folder / "dataset.toml").write_text("format = 9\n", "utf-8")
     assert "has the format 9" in str(DatasetFacts.of(folder).problem)
 

@@ -12,7 +12,7 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, MarkState, append_marks, read_marks
-from plushsense.dataset.trimming import decide_trims, suggest_trims
+from plushsense.dataset.trimming import TrimDecisions, decide_trims, suggest_trims
 from plushsense.studio.app.selections import Selections
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review import signals as review_signals
@@ -325,7 +325,9 @@ def test_all_sure_suggestions_are_accepted_and_taken_back_at_once(review: Review
     surer = review.surer_than(above, ids)
     assert 0 < len(surer) < len(sorted_by) and surer == [i for i in ids if review.rows[i].confidence >= above > 0]
     # The library decides alike.
-    trims = decide_trims(Path(shutil.copytree(review.path, review.path.parent / "copy")), above=above, who=ME)
+    trims = decide_trims(
+        Path(shutil.copytree(review.path, review.path.parent / "copy")), TrimDecisions(above=above, who=ME)
+    )
     assert sorted(trims.accepted.marked) == sorted(surer)
     by_hand = surer[0]
     review.set(by_hand, start=3)

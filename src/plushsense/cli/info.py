@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,31 +13,30 @@ from plushsense.core.errors import ConfigError, printable
 from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
-    from plushsense.dataset.statistics import Duration, SummaryStatistics
+    from plushsense.dataset.statistics import Duration
     from plushsense.dataset.store import Dataset
 
 
 def run(args: argparse.Namespace) -> int:
-    statistics = bool(args.durations or args.by or args.channels)
     if Path(args.path).suffix == ".plush":
-        if statistics:
-            raise ConfigError(f"'{args.path}' is a bundle: --durations, --by and --channels describe a data set.")
+        if args.durations:
+            raise ConfigError(f"'{args.path}' is a bundle: --durations describe a data set.")
         return _bundle(args)
     from plushsense.dataset.index import open_dataset
 
     dataset = open_dataset(args.path)
     summary = dataset.summary()
-    rows = [(g["label"], g["affect"], g["recordings"], g["subjects"], g["median_s"]) for g in summary["gestures"]]
+    rows = [astuple(counts) for counts in dataset.gesture_counts()]
     text = [
         repr(dataset),
-        f"layout {summary['layout']}, {plural(summary['located_in_stream'], 'recording')} located in a stream, "
+        f"layout {summary['layout']}, {summary['located_in_stream']} recordings located in a stream, "
         f"{summary['with_warnings']} with warnings, {summary['excluded']} excluded",
         f"hash {summary['hash']}",
         "",
         table(("gesture", "affect", "recordings", "people", "median s"), rows),
     ]
-    if statistics:
-        more, lines = _statistics(args, dataset)
+    if args.durations:
+        more, lines = _durations(dataset)
         summary |= more
         text += ["", *lines]
     emit(args, summary, text)
@@ -70,43 +69,24 @@ def _bundle(args: argparse.Namespace) -> int:
     return 0
 
 
-def _statistics(args: argparse.Namespace, dataset: Dataset) -> tuple[dict[str, Any], list[str]]:
-    """Return the durations of the recordings, and with ``--channels`` the values of the channels: JSON and text."""
-    from plushsense.dataset.statistics import channel_table, duration_table
+def _durations(dataset: Dataset) -> tuple[dict[str, Any], list[str]]:
+    """Return the durations of the recordings: JSON and text."""
+    from plushsense.dataset.statistics import duration_table
 
-    durations = duration_table(dataset, args.by)
-    channels = channel_table(dataset) if args.channels else []
-    trimmed = sum(r.stop - r.start < r.rows for r in dataset.used)
-    result: dict[str, Any] = {
-        "by": args.by,
-        "trimmed": trimmed,
-        "durations": [asdict(d) for d in durations],
-        "channels": [asdict(c) for c in channels],
-    }
+    durations = duration_table(dataset)
+    trimmed = sum(d.trimmed for d in durations)
     simulated = " (a simulation: it says nothing about people)" if dataset.head.simulated else ""
     text = [f"Durations{simulated}: {plural(len(dataset.used), 'recording')}, {trimmed} trimmed", ""]
-    text += ["Whole recordings", _duration_table(durations, args.by, after=False), ""]
-    if trimmed:
-        text += ["After trimming", _duration_table(durations, args.by, after=True), ""]
-    if channels:
-        head = ("gesture", "channel", "unit", "rows", "mean", "sd")
-        rows = [(c.gesture, c.channel, c.unit, c.rows, f"{c.mean:.4g}", f"{c.sd:.4g}") for c in channels]
-        text += ["Channels, after trimming", table(head, rows)]
-    return result, text
+    head = ("gesture", "recordings", "people", "mean s", "median s", "variance s²", "range s", "rows")
+    for title, after in [("Whole recordings", False), ("After trimming", True)][: 2 if trimmed else 1]:
+        text += [title, table(head, [_duration_row(d, after) for d in durations]), ""]
+    return {"trimmed": trimmed, "durations": [asdict(d) for d in durations]}, text
 
 
-def _duration_table(durations: list[Duration], by: str | None, after: bool) -> str:
-    head = ("gesture", *((by,) if by else ()))
-    head += ("recordings", "people", "mean s", "median s", "variance s²", "range s", "rows")
-    return table(head, [_duration_row(d, bool(by), after) for d in durations])
-
-
-def _duration_row(d: Duration, grouped: bool, after: bool) -> tuple[object, ...]:
-    s: SummaryStatistics = d.after_s if after else d.before_s
-    rows: SummaryStatistics = d.after_rows if after else d.before_rows
+def _duration_row(d: Duration, after: bool) -> tuple[object, ...]:
+    s, rows = (d.after_s, d.after_rows) if after else (d.before_s, d.before_rows)
     return (
         d.gesture,
-        *([d.group] if grouped else []),
         d.recordings,
         d.people,
         f"{s.mean:.2f}",

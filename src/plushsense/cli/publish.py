@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
-from plushsense.cli.settings import listed, report_stages
+from plushsense.cli.settings import report_stages
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
+    from plushsense.dataset.publishing.checking import ValidationResult
     from plushsense.workflow.datasets import PublishSpec
 
 _MOST_PROBLEMS = 20
@@ -27,8 +28,8 @@ def _check(args: argparse.Namespace) -> int:
 
     if args.dataset:
         raise ConfigError("Give either DATASET OUT, or --check PACKAGE, not both.")
-    checked = validate_package(args.check, thorough=args.thorough)
-    _print_problems(args, checked.to_dict()["problems"])
+    checked = validate_package(args.check)
+    _print_problems(args, checked)
     verdict = "valid" if checked.valid else f"not valid: {len(checked.problems)} problems"
     emit(args, {"package": args.check, **checked.to_dict()}, f"{args.check}: {verdict}")
     return 0 if checked.valid else 1
@@ -40,10 +41,9 @@ def _publish(args: argparse.Namespace) -> int:
     if not args.dataset or not args.out:
         raise ConfigError("Publishing needs DATASET and OUT, or --check PACKAGE.  See  plushsense publish --help")
     spec = PublishSpec(
-        **options(args, "licence", "contact", "consent", "save", "key", "pseudonyms", "seed", "thorough"),
+        **options(args, "licence", "contact", "consent", "save", "key", "pseudonyms"),
         streams=not args.no_streams,
         excluded=args.allow_excluded,
-        columns=tuple(listed(args.allow_columns)),
         reidentification=not args.no_reidentification,
     )
     if args.without_metadata:
@@ -53,13 +53,11 @@ def _publish(args: argparse.Namespace) -> int:
         emit(args, copy.to_dict(), [text, *_about_key(spec)])
         return 0
     done = publish_dataset(args.dataset, args.out, spec, report_stages())
-    result = done.to_dict()
     _print_notes(args, [*done.warnings, *done.description.notes])
-    _print_problems(args, result["problems"])
-    megabytes = f"{result['bytes'] / 1e6:.1f} MB"
-    verdict = f"valid; {result['zip']}" if done.valid else f"not valid: {len(result['problems'])} problems, no zip"
-    text = f"{args.out}: {done.files} files, {megabytes}, {verdict}; {result['seconds']} s"
-    emit(args, result, [text, *_about_key(spec)])
+    _print_problems(args, done.checked)
+    verdict = f"valid; {done.zip}" if done.valid else f"not valid: {len(done.checked.problems)} problems, no zip"
+    text = f"{args.out}: {done.files} files, {done.bytes / 1e6:.1f} MB, {verdict}; {done.seconds:.1f} s"
+    emit(args, done.to_dict(), [text, *_about_key(spec)])
     return 0 if done.valid else 1
 
 
@@ -74,10 +72,10 @@ def _print_notes(args: argparse.Namespace, notes: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
-def _print_problems(args: argparse.Namespace, problems: list[dict[str, str]]) -> None:
+def _print_problems(args: argparse.Namespace, checked: ValidationResult) -> None:
     if args.json:
         return
-    for p in problems[:_MOST_PROBLEMS]:
-        say(f"{p['validator']}: {p['file'] or 'package'}: {p['problem']}")
-    if len(problems) > _MOST_PROBLEMS:
-        say(f"... and {len(problems) - _MOST_PROBLEMS} more; --json lists all")
+    for p in checked.problems[:_MOST_PROBLEMS]:
+        say(f"{p.validator}: {p.file or 'package'}: {p.problem}")
+    if len(checked.problems) > _MOST_PROBLEMS:
+        say(f"... and {len(checked.problems) - _MOST_PROBLEMS} more; --json lists all")

@@ -19,19 +19,18 @@ _LINES = 20
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.dataset.trimming import decide_trims
+    from plushsense.dataset.trimming import TrimDecisions, decide_trims
 
     if args.plot:
         from plushsense.reports.quality_figures import check_picture_path
 
         check_picture_path(Path(args.plot))
-    result = decide_trims(
-        args.dataset,
+    decisions = TrimDecisions(
         **options(args, "only", "accept", "undo", "offset", "who", "why"),
         above=args.accept_above,
         keep=[(identity, *seconds_between("--set", text)) for identity, text in args.set],
-        progress=ProgressReporter("reading"),
     )
+    result = decide_trims(args.dataset, decisions, ProgressReporter("reading"))
     drawn: list[Path] = []
     if args.plot:
         from plushsense.reports.quality_figures import save_trims
@@ -62,19 +61,12 @@ def _print(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> Non
     }
     # After a decision only the changed recordings are listed.
     decided = _decides(args)
-    rows = [
-        (
-            r["recording"],
-            r["rows"],
-            f"{r['start_s']:.2f}",
-            f"{r['stop_s']:.2f}",
-            f"{r['confidence']:.2f}",
-            r["state"],
-            r["note"],
-        )
-        for r in result["recordings"]
-        if not decided or r["recording"] in done.changed
-    ]
+    rows = []
+    for t in done.trims:
+        if not decided or t.recording.id in done.changed:
+            start, stop = (f"{t.seconds[row]:.2f}" for row in t.current_rows(args.offset))
+            surest = f"{t.suggestion.onset_confidence:.2f}"
+            rows.append((t.recording.id, t.recording.rows, start, stop, surest, t.state, t.suggestion.why))
     if not args.json and (args.accept or args.accept_above is not None):
         below = " or below the confidence" if args.accept_above else ""
         say(

@@ -165,7 +165,7 @@ class About:
         if not re.fullmatch(r"[a-zA-Z]{2,3}(-[a-zA-Z0-9]{2,8})*", self.language):
             raise DatasetError(f"language is '{self.language}': a code like en is accepted.")
 
-    def to_table(self) -> dict[str, Any]:
+    def to_table(self) -> dict[str, object]:
         """Return plain values for TOML, without those that have the default."""
         defaults = asdict(About())
         return {k: _without_blanks(v) for k, v in asdict(self).items() if v != defaults[k]}

@@ -9,20 +9,18 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
-import stat
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from pathlib import Path
+from typing import IO
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import new_folder, replacing_file, work_folder
 from plushsense.core.toml import load_table
 from plushsense.dataset.files import list_files
-from plushsense.dataset.importing.archives import DAMAGED, UnpackLimits, zip_entry
+from plushsense.dataset.importing.archives import DAMAGED, UnpackLimits, member_target, refusal, zip_entry
 from plushsense.dataset.index import open_dataset, rebuild_index
 from plushsense.dataset.store import HEAD, Dataset, Progress
 
@@ -33,7 +31,9 @@ _CHUNK = 1 << 20
 _LEFT_OUT = ("cache", "index", "working")
 # A manifest has about 150 bytes per file.
 _MANIFEST_LIMIT = 1 << 28
-# Exceptions for a damaged zip, or a member of the manifest that is missing.
+# The manifest has the size of each file, so that the expansion ratio needs no limit.
+_ANY_RATIO = UnpackLimits(ratio=2**59)
+# Exceptions for a damaged zip, or a manifest that is none.
 _BROKEN: tuple[type[Exception], ...] = (*DAMAGED, KeyError, IndexError)
 _NO_MANIFEST: tuple[type[Exception], ...] = (*_BROKEN, TypeError, AttributeError, OSError, RecursionError)
 
@@ -57,10 +57,10 @@ class Manifest:
     hash: str
     files: tuple[BackupFile, ...]
 
-    def to_json(self) -> bytes:
-        """Return the text in the zip."""
-        table = {"format": FORMAT, "version": VERSION, **asdict(self)}
-        return f"{json.dumps(table, ensure_ascii=False, indent=0)}\n".encode()
+    @property
+    def bytes(self) -> int:
+        """Size of all files."""
+        return sum(file.bytes for file in self.files)
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,11 @@ class BackupResult:
     subjects: int
     hash: str
     left_out: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, file: Path, m: Manifest, left_out: tuple[str, ...] = ()) -> BackupResult:
+        """Summarise the backup ``file`` with the manifest ``m``."""
+        return cls(str(file), m.name, len(m.files), m.bytes, m.recordings, m.subjects, m.hash, left_out)
 
 
 def backup(dataset: str | Path, file: str | Path, progress: Progress | None = None) -> BackupResult:
@@ -95,8 +100,14 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         listed = [f for f in list_files(folder) if f.kind not in _LEFT_OUT]
-        paths = [f.path for f in listed if f.kind != "link"]
-        _refuse_names(folder, paths)
+        links, paths = ([f.path.as_posix() for f in listed if (f.kind == "link") is link] for link in (True, False))
+        if odd := next((path for path in paths if not _is_portable(path)), None):
+            name = odd.encode(errors="backslashreplace").decode()
+            raise DatasetError(
+                "'{file}' in '{folder}' has a name that a backup cannot hold on every system: rename it.",
+                file=name,
+                folder=folder,
+            )
         finishing = source.generation.writing
         with work_folder(target) as work, replacing_file(target, within=work, finishing=finishing) as part:
             manifest = _write(part, source, paths, progress or (lambda done, total: None))
@@ -109,7 +120,7 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
             file=cause.filename or target,
             where=f" ('{cause.filename or target}')",
         ) from None
-    return _summary(target, manifest, tuple(f.path.as_posix() for f in listed if f.kind == "link"))
+    return BackupResult.of(target, manifest, tuple(links))
 
 
 def _refuse_existing(target: Path, state: str) -> None:
@@ -119,32 +130,53 @@ def _refuse_existing(target: Path, state: str) -> None:
         )
 
 
-def _refuse_names(folder: Path, paths: Iterable[PurePosixPath]) -> None:
-    for path in paths:
-        if _name_refusal(path.as_posix()):
-            name = path.as_posix().encode(errors="backslashreplace").decode()
-            raise DatasetError(
-                "'{file}' in '{folder}' has a name that a backup cannot hold on every system: rename it.",
-                file=name,
-                folder=folder,
-            )
+def _is_portable(name: str) -> bool:
+    """Return whether a file of this name in a zip can be unpacked on every system, to the place that it names."""
+    target = member_target(name)
+    return not isinstance(target, str) and target.as_posix() == name
 
 
-def _write(part: Path, source: Dataset, paths: Sequence[PurePosixPath], progress: Progress) -> Manifest:
+def _write(part: Path, source: Dataset, paths: list[str], progress: Progress) -> Manifest:
     """Write the zip ``part``, and verify it; half of the progress is the verification."""
-    folder = source.path
-    total, done = 2 * sum((folder / path).stat().st_size for path in paths), 0
+    total, done = 2 * sum((source.path / path).stat().st_size for path in paths), 0
     files = []
     with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in paths:
-            files.append(_store(archive, folder, path))
+            files.append(_store(archive, source.path, path))
             done += files[-1].bytes
             progress(done, total)
         people = len(source.subjects)
         manifest = Manifest(source.head.name, len(source.recordings), people, source.hash, tuple(files))
-        archive.writestr(zip_entry(MANIFEST), manifest.to_json())
+        table = {"format": FORMAT, "version": VERSION, **asdict(manifest)}
+        archive.writestr(zip_entry(MANIFEST), f"{json.dumps(table, ensure_ascii=False, indent=0)}\n".encode())
     _verify(part, lambda n: progress(total // 2 + n, total))
     return manifest
+
+
+def _store(archive: zipfile.ZipFile, folder: Path, path: str) -> BackupFile:
+    with (folder / path).open("rb") as file:
+        before = os.fstat(file.fileno())
+        with archive.open(zip_entry(path), "w", force_zip64=before.st_size >= 1 << 31) as member:
+            size, sha256 = _copy(file, member)
+        after = os.fstat(file.fileno())
+    if size != before.st_size or (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
+        raise DatasetError(
+            "'{folder}' changed while it was saved: back up when nothing is recorded.",
+            folder=folder / path,
+            file=Path(path).name,
+        )
+    return BackupFile(path, size, sha256)
+
+
+def _copy(file: IO[bytes], out: IO[bytes] | None, limit: float = float("inf")) -> tuple[int, str]:
+    """Copy a file, to nowhere if ``out`` is None, until more than ``limit`` bytes; return its size and SHA-256."""
+    digest, size = hashlib.sha256(), 0
+    while size <= limit and (chunk := file.read(_CHUNK)):
+        digest.update(chunk)
+        size += len(chunk)
+        if out is not None:
+            out.write(chunk)
+    return size, digest.hexdigest()
 
 
 def check_backup(file: str | Path, progress: Progress | None = None) -> BackupResult:
@@ -155,8 +187,17 @@ def check_backup(file: str | Path, progress: Progress | None = None) -> BackupRe
     """
     path = Path(file)
     total = path.stat().st_size if path.is_file() else 0
-    manifest = _verify(path, lambda n: progress(min(n, total), total) if progress is not None else None)
-    return _summary(path, manifest)
+    return BackupResult.of(path, _verify(path, lambda n: progress(min(n, total), total) if progress else None))
+
+
+def _verify(path: Path, progress: Callable[[int], None]) -> Manifest:
+    with _open_backup(path) as (archive, manifest):
+        done = 0
+        for entry in manifest.files:
+            _read(path, archive, entry)
+            done += entry.bytes
+            progress(done)
+    return manifest
 
 
 def is_backup(file: str | Path) -> bool:
@@ -182,8 +223,7 @@ def restore(
     """
     path, folder = Path(file), Path(dest)
     with _open_backup(path) as (archive, manifest):
-        total = sum(entry.bytes for entry in manifest.files)
-        (limits or UnpackLimits()).check(path, len(manifest.files), total, folder)
+        (limits or UnpackLimits()).check(path, len(manifest.files), manifest.bytes, folder)
         done = 0
         with new_folder(folder, DatasetError, last=HEAD) as work:
             for entry in manifest.files:
@@ -193,7 +233,7 @@ def restore(
                     _read(path, archive, entry, out)
                 done += entry.bytes
                 if progress is not None:
-                    progress(done, total)
+                    progress(done, manifest.bytes)
             again = rebuild_index(work).dataset
             if again.hash != manifest.hash:
                 raise DatasetError(
@@ -206,29 +246,15 @@ def restore(
     return open_dataset(folder)
 
 
-def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> BackupFile:
-    digest = hashlib.sha256()
-    size = 0
-    with (folder / path).open("rb") as file:
-        before = os.fstat(file.fileno())
-        with archive.open(zip_entry(path.as_posix()), "w", force_zip64=before.st_size >= 1 << 31) as member:
-            while chunk := file.read(_CHUNK):
-                digest.update(chunk)
-                size += len(chunk)
-                member.write(chunk)
-        after = os.fstat(file.fileno())
-    if size != before.st_size or (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
-        raise DatasetError(
-            "'{folder}' changed while it was saved: back up when nothing is recorded.",
-            folder=folder / path,
-            file=path.name,
-        )
-    return BackupFile(path.as_posix(), size, digest.hexdigest())
-
-
-def _summary(file: Path, manifest: Manifest, left_out: tuple[str, ...] = ()) -> BackupResult:
-    m, total = manifest, sum(entry.bytes for entry in manifest.files)
-    return BackupResult(str(file), m.name, len(m.files), total, m.recordings, m.subjects, m.hash, left_out)
+def _read(path: Path, archive: zipfile.ZipFile, entry: BackupFile, out: IO[bytes] | None = None) -> None:
+    """Read a member, write it to ``out`` if given, and raise DatasetError if it differs from the manifest."""
+    try:
+        with archive.open(entry.path) as member:
+            copied = _copy(member, out, entry.bytes)
+    except _BROKEN as cause:
+        raise _damaged(path, f"'{entry.path}': {cause}") from None
+    if copied != (entry.bytes, entry.sha256):
+        raise _damaged(path, f"'{entry.path}' differs from the saved file")
 
 
 def _damaged(path: Path, why: object) -> DatasetError:
@@ -238,12 +264,10 @@ def _damaged(path: Path, why: object) -> DatasetError:
 @contextmanager
 def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, Manifest]]:
     """Open a backup and check that its members are those of its manifest."""
-    if path.exists() and not path.is_file():
-        raise DatasetError("'{path}' is no file: give a backup.", path=path)
+    if not path.is_file():
+        raise DatasetError("There is no backup '{path}': check the path.", path=path)
     try:
         archive = zipfile.ZipFile(path)
-    except FileNotFoundError:
-        raise DatasetError("There is no backup '{path}': check the path.", path=path) from None
     except OSError as cause:
         raise DatasetError(
             "The backup '{path}' cannot be read ({why}).", path=path, why=cause.strerror or cause
@@ -269,45 +293,30 @@ def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, Manifest]]:
                     info=info.filename,
                     reason=reason,
                 )
-        if len(set(names)) != len(names):
-            raise _damaged(path, "it holds a name twice")
         manifest = _manifest_of(path, archive)
-        listed = {entry.path for entry in manifest.files}
-        if odd := sorted(listed ^ (set(names) - {MANIFEST})):
-            reason = "is missing" if odd[0] in listed else "is not in the manifest"
-            raise _damaged(path, f"'{odd[0]}' {reason}")
+        listed = [MANIFEST, *(entry.path for entry in manifest.files)]
+        if sorted(listed) != sorted(names):
+            odd = next(iter({*listed} ^ {*names}), "")
+            reason = "is missing" if odd in listed else "is not in the manifest"
+            raise _damaged(path, f"'{odd}' {reason}" if odd else "it holds a name twice")
         yield archive, manifest
-
-
-def _name_refusal(name: str) -> str:
-    """Return the reason why a path cannot be in a backup; "" if it can."""
-    if name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or "\0" in name:
-        return "an absolute path or one of another system"
-    if any(part in ("", ".", "..") for part in name.split("/")):
-        return "a folder, or a path that leaves its place"
-    if name.encode(errors="replace").decode() != name:
-        return "a name that is no text"
-    return ""
 
 
 def _refusal(info: zipfile.ZipInfo) -> str:
     """Return the reason why a member must not be unpacked; "" if it may."""
     # zipfile cuts a name at a zero byte; ``orig_filename`` keeps it.
-    if reason := _name_refusal(info.orig_filename if "\0" in info.orig_filename else info.filename):
-        return reason
-    kind = stat.S_IFMT(info.external_attr >> 16)
-    if kind not in (0, stat.S_IFREG):
-        return "a link or no plain file"
+    if not _is_portable(info.orig_filename if "\0" in info.orig_filename else info.filename):
+        return "a path that leaves its place, or that not every system can hold"
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         return "compressed by a method that PlushSense does not use: damaged, or changed by another program"
-    return ""
+    return "a link or no plain file" if refusal(info, _ANY_RATIO) else ""
 
 
 def _manifest_of(path: Path, archive: zipfile.ZipFile) -> Manifest:
     try:
         if archive.getinfo(MANIFEST).file_size > _MANIFEST_LIMIT:
             raise ValueError("its manifest is too long")
-        table: dict[str, Any] = json.loads(archive.read(MANIFEST))
+        table = json.loads(archive.read(MANIFEST))
         if table.pop("format") != FORMAT:
             raise ValueError("its manifest has another format")
         if (version := table.pop("version")) != VERSION:
@@ -325,33 +334,4 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> Manifest:
         raise _damaged(path, cause) from None
     if any(entry.bytes < 0 for entry in manifest.files):
         raise _damaged(path, "a file in its manifest has less than 0 bytes")
-    return manifest
-
-
-def _read(path: Path, archive: zipfile.ZipFile, entry: BackupFile, out: IO[bytes] | None = None) -> None:
-    """Read a member, write it to ``out`` if given, and raise DatasetError if it differs from the manifest."""
-    digest = hashlib.sha256()
-    size = 0
-    try:
-        with archive.open(entry.path) as member:
-            while chunk := member.read(_CHUNK):
-                size += len(chunk)
-                if size > entry.bytes:
-                    break
-                digest.update(chunk)
-                if out is not None:
-                    out.write(chunk)
-    except _BROKEN as cause:
-        raise _damaged(path, f"'{entry.path}': {cause}") from None
-    if size != entry.bytes or digest.hexdigest() != entry.sha256:
-        raise _damaged(path, f"'{entry.path}' differs from the saved file")
-
-
-def _verify(path: Path, progress: Callable[[int], None]) -> Manifest:
-    with _open_backup(path) as (archive, manifest):
-        done = 0
-        for entry in manifest.files:
-            _read(path, archive, entry)
-            done += entry.bytes
-            progress(done)
     return manifest

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import math
 import os
-import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -40,8 +38,6 @@ from plushsense.dataset.store import (
     write_index,
 )
 from plushsense.recording.takes import measured_rate_hz
-
-_SHA256 = re.compile("[0-9a-f]{64}")
 
 
 @dataclass
@@ -149,21 +145,14 @@ def _rebuilt(folder: Path, head: DatasetHead) -> Dataset:
     return built.dataset
 
 
-def _digests(recordings: Iterable[RecordingInfo], streams: Iterable[StreamInfo]) -> dict[str, str]:
-    return {r.file: r.sha256 for r in recordings} | {s.file: s.sha256 for s in streams}
-
-
 def _refuse_changed(folder: Path, now: Dataset) -> None:
     """Raise DatasetError if a raw file is not the one that the index on disk describes."""
-    try:
-        recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
-        streams = read_index(folder / STREAMS_INDEX, StreamInfo)
-    except DatasetError:
+    before = _read_index(folder)
+    if before is None:
         return
-    before = _digests(recordings, streams)
-    files = _digests(now.recordings, now.streams)
-    changed = sorted(file for file, sha256 in files.items() if before.get(file, sha256) != sha256)
-    if changed:
+    known = {info.file: info.sha256 for infos in before for info in infos}
+    files = {info.file: info.sha256 for infos in (now.recordings, now.streams) for info in infos}
+    if changed := sorted(file for file, sha256 in files.items() if known.get(file, sha256) != sha256):
         raise DatasetError(
             "{n} raw file{more} in '{folder}' changed since the import ('{file}'), but raw files are never "
             "rewritten: restore them, or delete {stamp} there to go on with what they hold now.",
@@ -175,67 +164,20 @@ def _refuse_changed(folder: Path, now: Dataset) -> None:
         )
 
 
-def _indexed(
-    folder: Path, head: DatasetHead, generation: Generation, raw: Mapping[str, tuple[int, int]]
-) -> Dataset | None:
-    """Return the data set as its index on disk describes it; None if the index is damaged.
-
-    ``raw`` are the raw files with size and time.
-    """
+def _read_index(folder: Path) -> tuple[list[RecordingInfo], list[StreamInfo]] | None:
+    """Return the rows of the index files; None if they are damaged."""
     try:
-        recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
-        streams = read_index(folder / STREAMS_INDEX, StreamInfo)
+        return read_index(folder / RECORDINGS_INDEX, RecordingInfo), read_index(folder / STREAMS_INDEX, StreamInfo)
     except DatasetError:
         return None
-    files = {name: size for name, (size, _) in raw.items()}
-    known = {s.id: s for s in streams}
-    right = all(_is_stream_of(s, files) for s in streams) and all(_is_recording_of(r, files, known) for r in recordings)
-    distinct = len(known) == len(streams) and len({r.id for r in recordings}) == len(recordings)
-    if not right or not distinct or {r.file for r in recordings} | {s.file for s in streams} != set(files):
+
+
+def _indexed(folder: Path, head: DatasetHead, generation: Generation, files: Iterable[str]) -> Dataset | None:
+    """Return the data set as its index on disk describes it; None if that is damaged, or not of the raw ``files``."""
+    index = _read_index(folder)
+    if index is None or {info.file for infos in index for info in infos} != set(files):
         return None
-    return Dataset(folder, head, recordings, streams, generation)
-
-
-def _is_stream_of(info: StreamInfo, files: Mapping[str, int]) -> bool:
-    """Return whether a row of the index describes one of the raw ``files`` (sizes by name), with values in range."""
-    expected = _stem(info.file, STREAMS)
-    return (
-        info.id == expected
-        and info.subject == expected.partition("/")[0]
-        and 0 < info.rows <= files.get(info.file, 0)
-        and 0 <= info.restarts <= info.rows
-        and 0.0 <= info.seconds < math.inf
-        and _SHA256.fullmatch(info.sha256) is not None
-    )
-
-
-def _is_recording_of(info: RecordingInfo, files: Mapping[str, int], streams: Mapping[str, StreamInfo]) -> bool:
-    """Return whether a row describes a recording with values in range, like `_is_stream_of`.
-
-    Its file is one of its own, or that of one of the ``streams`` (by id).
-    """
-    part_of = info.file.startswith(f"{STREAMS}/")
-    stream = streams.get(info.stream)
-    home = info.stream if part_of else _stem(info.file, RECORDINGS)
-    return (
-        (info.id.startswith(f"{home}#") if part_of else info.id == home)
-        and info.subject in (home.partition("/")[0], NOBODY)
-        and (stream is not None or (not info.stream and not part_of))
-        and (not part_of or (stream is not None and info.file == stream.file))
-        and 0 < info.rows <= files.get(info.file, 0)
-        and 0 <= info.start <= info.stop <= info.rows
-        and info.first_row >= 0
-        and (not part_of or (stream is not None and info.first_row + info.rows <= stream.rows))
-        and -1 <= info.stream_row < (stream.rows if stream is not None else 0)
-        and max(abs(info.start_ms), abs(info.epoch_ms)) < 1 << 62
-        and 0.0 <= info.rate_hz < math.inf
-        and _SHA256.fullmatch(info.sha256) is not None
-    )
-
-
-def _stem(file: str, kind: str) -> str:
-    """Return the path of a raw file below the folder ``kind``, without its suffix; "" for another file."""
-    return file.removeprefix(f"{kind}/").rpartition(".")[0] if file.startswith(f"{kind}/") else ""
+    return Dataset(folder, head, *index, generation)
 
 
 def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> IndexBuild:

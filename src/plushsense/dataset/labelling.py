@@ -29,7 +29,6 @@ from plushsense.dataset.marks import (
     LabelledStretch,
     Mark,
     MarkState,
-    apply_mark,
     match_ids,
     read_marks,
 )
@@ -138,15 +137,15 @@ def timed_stretches(dataset: Dataset, streams: Iterable[StreamInfo]) -> list[Tim
 
 def label_stretches(
     dataset: Dataset, stretches: Iterable[LabelledStretch], who: str | None = None, why: str = ""
-) -> list[LabelledStretch]:
-    """Label stretches by marks, in their order; return those that the marks did not state already.
+) -> int:
+    """Label stretches by marks, in their order; return how many the marks did not state already.
 
     Earlier labels of the same rows are replaced. ``dataset`` is not updated: open it again.
 
     Raises:
         DatasetError: for an unknown label or stream, or rows that do not exist. No mark is written then.
     """
-    checked = []
+    name, marks = author_name(who), []
     for s in stretches:
         (stream,) = find_streams(dataset, s.stream)
         if not 0 <= s.start < s.stop <= stream.rows:
@@ -157,24 +156,15 @@ def label_stretches(
                 start=s.start,
                 stop=s.stop,
             )
-        checked.append(LabelledStretch(s.stream, s.start, s.stop, check_label(dataset, s.label)))
-    name, now = author_name(who), dict(read_marks(dataset.path))
-    marks, new = [], []
-    for s in checked:
-        before = now.get(s.stream, MarkState())
-        mark = Mark(s.stream, "label", name, why, start=s.start, stop=s.stop, label=s.label)
-        if (after := apply_mark(before, mark)) != before:
-            now[s.stream] = after
-            marks.append(mark)
-            new.append(s)
-    dataset.append_marks(marks)
-    return new
+        label = check_label(dataset, s.label)
+        marks.append(Mark(stream.id, "label", name, why, start=s.start, stop=s.stop, label=label))
+    return len(dataset.append_marks(marks))
 
 
 def relabel_recordings(
     dataset: Dataset, recordings: Iterable[str], gesture: str, who: str | None = None, why: str = ""
 ) -> tuple[str, ...]:
-    """State that ``gesture`` was made in ``recordings`` (ids); "" restores the recorded one.
+    """State that ``gesture`` was made in ``recordings`` (ids or patterns); "" restores the recorded one.
 
     The raw files stay as they are. ``dataset`` is not updated: open it again.
 
@@ -184,20 +174,11 @@ def relabel_recordings(
     Raises:
         DatasetError: for a gesture that is not in the gesture set, or an unknown recording. No mark is written then.
     """
-    known, standing = {r.id: r for r in dataset.recordings}, read_marks(dataset.path)
-    label = _gesture_label(dataset, gesture)
-    marks = []
-    for identity in recordings:
-        (identity,) = match_ids(identity, known, "recording")
-        new = "" if label == known[identity].recorded else label
-        if new != standing.get(identity, MarkState()).gesture:
-            marks.append(Mark(identity, "relabel", author_name(who), why, gesture=new))
-    dataset.append_marks(marks)
-    return tuple(mark.recording for mark in marks)
+    return tuple(m.recording for m in dataset.append_marks(_relabelling(dataset, recordings, gesture, who, why)))
 
 
-def _gesture_label(dataset: Dataset, gesture: str) -> str:
-    """Return ``gesture`` as the data set writes it; "" stays."""
+def _relabelling(dataset: Dataset, recordings: Iterable[str], gesture: str, who: str | None, why: str) -> list[Mark]:
+    known = {r.id: r.recorded for r in dataset.recordings}
     found = dataset.gestures.find(gesture) if gesture else None
     if gesture and found is None:
         raise DatasetError(
@@ -207,17 +188,20 @@ def _gesture_label(dataset: Dataset, gesture: str) -> str:
             labels=", ".join(dataset.gestures.labels),
             hint=nearest(gesture, dataset.gestures.labels),
         )
-    return found.label if found is not None else ""
+    label, name = found.label if found is not None else "", author_name(who)
+    return [
+        Mark(identity, "relabel", name, why, gesture="" if label == known[identity] else label)
+        for pattern in recordings
+        for identity in match_ids(pattern, known, "recording")
+    ]
 
 
 def remove_labels(dataset: Dataset, stream: str, rows: tuple[int, int], who: str | None = None, why: str = "") -> int:
     """Remove the labels of ``rows`` (start, stop) of a stream; return the number of stretches that change."""
     start, stop = rows
     standing = read_marks(dataset.path).get(stream, MarkState()).stretches
-    changed = sum(s.outside(start, stop) != [s] for s in standing)
-    if changed:
-        dataset.append_marks([Mark(stream, "unlabel", author_name(who), why, start=start, stop=stop)])
-    return changed
+    dataset.append_marks([Mark(stream, "unlabel", author_name(who), why, start=start, stop=stop)])
+    return sum(s.outside(start, stop) != [s] for s in standing)
 
 
 def read_stretches(dataset: Dataset, path: str | os.PathLike[str]) -> list[LabelledStretch]:
@@ -323,16 +307,13 @@ def decide_labels(
         LabelledStretch(*_rows_of(dataset, stream, times), check_label(dataset, name)) for stream, times, name in label
     ]
     removed = [_rows_of(dataset, s.id, times) for stream, times in unlabel for s in find_streams(dataset, stream)]
-    known = {r.id for r in dataset.recordings}
-    changes = [
-        (match_ids(pattern, known, "recording"), _gesture_label(dataset, gesture)) for pattern, gesture in relabel
-    ]
-    labelled = len(label_stretches(dataset, new, who, why))
+    changes = [mark for pattern, gesture in relabel for mark in _relabelling(dataset, [pattern], gesture, who, why)]
+    labelled = label_stretches(dataset, new, who, why) if new else 0
     undone = sum(remove_labels(dataset, stream, (start, stop), who, why) for stream, start, stop in removed)
-    changed = [i for ids, gesture in changes for i in relabel_recordings(dataset, ids, gesture, who, why)]
+    changed = tuple(mark.recording for mark in dataset.append_marks(changes))
     again = as_dataset(dataset.path)
     streams = again.streams if not again.layout.is_labelled else []
-    return LabelResult(again, tuple(timed_stretches(again, streams)), labelled, undone, tuple(changed))
+    return LabelResult(again, tuple(timed_stretches(again, streams)), labelled, undone, changed)
 
 
 def _rows_of(dataset: Dataset, stream: str, times: Seconds) -> tuple[str, int, int]:

@@ -122,29 +122,28 @@ def _refuse_contradictions(mark: Mark, where: str) -> None:
             actions=", ".join(ACTIONS),
             hint=nearest(mark.action, ACTIONS),
         )
-    for key, low in (("start", 0), ("stop", -1)):
-        if (value := getattr(mark, key)) < low:
-            raise DatasetError(f"{where}: {key} is {value}; it must be a whole number from {low} on.")
-    if bool(mark.check) != (mark.action in ("accept", "unaccept")):
-        raise DatasetError(
-            f"{where}: a mark '{mark.action}' with check '{mark.check}'; accept and unaccept name a check."
-        )
-    if mark.how not in ("", BY_HAND, SUGGESTED) or (mark.how and mark.action != "trim"):
-        raise DatasetError(
-            f"{where}: a mark '{mark.action}' made by '{mark.how}'; a trim may be by {BY_HAND} or {SUGGESTED}."
-        )
-    if 0 <= mark.stop <= mark.start:
-        raise DatasetError(f"{where}: rows {mark.start} to {mark.stop} keep nothing; stop must be above start, or -1.")
     is_label = mark.label in (HANDLING, REST) or (mark.label.startswith(PRACTICE) and mark.label != PRACTICE)
-    if is_label != (mark.action == "label") or (mark.label and not is_label):
-        raise DatasetError(
-            f"{where}: a mark '{mark.action}' with label '{mark.label}'; only the action label has one: {HANDLING}, "
-            f"{REST}, or {PRACTICE} and a gesture."
-        )
-    if mark.gesture and mark.action != "relabel":
-        raise DatasetError(f"{where}: a mark '{mark.action}' with gesture '{mark.gesture}'; only relabel has one.")
-    if mark.action == "label" and mark.stop < 0:
-        raise DatasetError(f"{where}: a mark 'label' without stop; it needs the row after its last one.")
+    checks = mark.action in ("accept", "unaccept")
+    for wrong, problem in (
+        (mark.start < 0, "start is {m.start}; it must be a whole number from 0 on."),
+        (mark.stop < -1, "stop is {m.stop}; it must be a whole number from -1 on."),
+        (0 <= mark.stop <= mark.start, "rows {m.start} to {m.stop} keep nothing; stop must be above start, or -1."),
+        (bool(mark.check) != checks, "{a} with check '{m.check}'; accept and unaccept name a check."),
+        (
+            mark.how not in ("", BY_HAND, SUGGESTED) or (mark.how and mark.action != "trim"),
+            f"{{a}} made by '{{m.how}}'; a trim may be by {BY_HAND} or {SUGGESTED}.",
+        ),
+        (
+            is_label != (mark.action == "label") or (mark.label and not is_label),
+            f"{{a}} with label '{{m.label}}'; only the action label has one: {HANDLING}, {REST}, or {PRACTICE} and a "
+            "gesture.",
+        ),
+        (mark.gesture and mark.action != "relabel", "{a} with gesture '{m.gesture}'; only relabel has one."),
+        (mark.action == "label" and mark.stop < 0, "{a} without stop; it needs the row after its last one."),
+    ):
+        if wrong:
+            problem = problem.format(m=mark, a=f"a mark '{mark.action}'")
+            raise DatasetError(f"{where}: {problem}")
 
 
 def match_ids(pattern: str, known: Iterable[str], kind: str) -> list[str]:

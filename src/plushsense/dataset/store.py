@@ -36,7 +36,7 @@ from plushsense.core.recorder_csv import Frames, ReadResult, read_bytes, read_re
 from plushsense.core.sentences import plural
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About, HeadFile
-from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, locked, read_marks
+from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, apply_mark, locked, read_marks
 from plushsense.recording.takes import duration_s
 
 FORMAT_VERSION = 1
@@ -326,6 +326,17 @@ def _texts_by_key(value: object, key: str = "") -> Iterator[tuple[str, str]]:
         yield key, value
 
 
+@dataclass(frozen=True)
+class GestureCounts:
+    """Numbers of the used recordings of a gesture and of their people, and the median duration."""
+
+    label: str
+    affect: str
+    recordings: int
+    subjects: int
+    median_s: float | None
+
+
 class Dataset:
     """A data set, opened for reading.
 
@@ -422,14 +433,23 @@ class Dataset:
                 pieces = [rest for piece in pieces for rest in piece.outside(first, last)]
         return pieces
 
-    def append_marks(self, marks: Iterable[Mark]) -> None:
-        """Append marks, unless a person was removed since the data set was opened; this object is not updated.
+    def append_marks(self, marks: Iterable[Mark]) -> tuple[Mark, ...]:
+        """Append those of ``marks``, in their order, that change something, and return them.
+
+        This object is not updated: open the data set again.
 
         Raises:
-            ForgottenError: like `Generation.check`.
+            ForgottenError: if a person was removed since the data set was opened, see `Generation.check`.
             DatasetError: like `plushsense.dataset.marks.append_marks`.
         """
-        append_marks(self.path, marks, self.generation.check)
+        standing, new = dict(read_marks(self.path)), []
+        for mark in marks:
+            before = standing.get(mark.recording, MarkState())
+            standing[mark.recording] = apply_mark(before, mark)
+            if standing[mark.recording] != before:
+                new.append(mark)
+        append_marks(self.path, new, self.generation.check)
+        return tuple(new)
 
     def read(self, recording: RecordingInfo) -> Frames:
         """Read the rows of one recording that remain after trimming."""
@@ -488,21 +508,19 @@ class Dataset:
             digest.update(repr((stretch.stream, stretch.start, stretch.stop, stretch.label)).encode())
         return digest.hexdigest()
 
-    def summary(self) -> dict[str, Any]:
-        """Return counts for a report: people, recordings, streams, duration by gesture."""
-        by_gesture = []
+    def gesture_counts(self) -> list[GestureCounts]:
+        """Count the used recordings of each gesture of the set."""
+        counts = []
         for gesture in self.gestures.gestures:
             recordings = [r for r in self.used if r.gesture == gesture.label]
             seconds = sorted(r.seconds for r in recordings if r.rate_hz > 0)
-            by_gesture.append(
-                {
-                    "label": gesture.label,
-                    "affect": gesture.affect,
-                    "recordings": len(recordings),
-                    "subjects": len({r.subject for r in recordings} - {NOBODY, UNKNOWN_SUBJECT}),
-                    "median_s": round(seconds[len(seconds) // 2], 2) if seconds else None,
-                }
-            )
+            people = {r.subject for r in recordings} - {NOBODY, UNKNOWN_SUBJECT}
+            median_s = round(seconds[len(seconds) // 2], 2) if seconds else None
+            counts.append(GestureCounts(gesture.label, gesture.affect, len(recordings), len(people), median_s))
+        return counts
+
+    def summary(self) -> dict[str, object]:
+        """Return counts for JSON: people, recordings, streams, durations by gesture."""
         return {
             "name": self.head.name,
             "licence": self.head.licence or None,
@@ -514,7 +532,7 @@ class Dataset:
             "streams": len(self.streams),
             "located_in_stream": sum(r.stream_row >= 0 for r in self.recordings),
             "with_warnings": sum(bool(r.flags) for r in self.recordings),
-            "gestures": by_gesture,
+            "gestures": [vars(counts) for counts in self.gesture_counts()],
             "hash": self.hash,
         }
 
@@ -527,9 +545,9 @@ class Dataset:
 
     def _repr_html_(self) -> str:
         rows = "".join(
-            f"<tr><td>{html.escape(str(g['label']))}</td><td>{g['affect']}</td><td>{g['recordings']}</td>"
-            f"<td>{g['subjects']}</td><td>{g['median_s']}</td></tr>"
-            for g in self.summary()["gestures"]
+            f"<tr><td>{html.escape(g.label)}</td><td>{g.affect}</td><td>{g.recordings}</td>"
+            f"<td>{g.subjects}</td><td>{g.median_s}</td></tr>"
+            for g in self.gesture_counts()
         )
         head = "".join(f"<th>{h}</th>" for h in ("gesture", "affect", "recordings", "people", "median s"))
         return f"<p>{html.escape(repr(self))}</p><table><tr>{head}</tr>{rows}</table>"

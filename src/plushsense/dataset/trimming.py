@@ -12,7 +12,6 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +65,7 @@ class Trim:
         stop = self.recording.rows if self.mark_state.stop < 0 else min(self.mark_state.stop, self.recording.rows)
         return min(self.mark_state.start, stop), stop
 
-    def to_dict(self, offset: bool = False) -> dict[str, Any]:
+    def to_dict(self, offset: bool = False) -> dict[str, object]:
         """Return plain values for JSON: `current_rows` and the suggestion."""
         start, stop = self.current_rows(offset)
         s = self.suggestion
@@ -163,21 +162,23 @@ def accept_suggestions(
 
     Trims set by hand stay, and existing marks are not written again. ``dataset`` is not updated: open it again.
     """
-    marks, already, not_visible, by_hand = [], [], [], []
+    marks, not_visible, by_hand = [], [], []
     for trim in chosen:
-        info = trim.recording
-        start, stop = trim.suggested_rows(offset, above)
+        info, rows = trim.recording, trim.suggested_rows(offset, above)
         if trim.state == "adjusted":
             by_hand.append(info.id)
-        elif (start, stop) == (0, info.rows):
+        elif rows == (0, info.rows):
             not_visible.append(info.id)
-        elif trim.mark_state.how == SUGGESTED and trim.current_rows() == (start, stop):
-            already.append(info.id)
         else:
-            end = stop if stop < info.rows else -1
-            marks.append(Mark(info.id, "trim", who, why, start=start, stop=end, how=SUGGESTED))
-    dataset.append_marks(marks)
-    return AcceptedTrims(tuple(m.recording for m in marks), tuple(already), tuple(not_visible), tuple(by_hand))
+            marks.append(_trim_mark(info, rows, who, why, SUGGESTED))
+    marked = tuple(m.recording for m in dataset.append_marks(marks))
+    already = tuple(m.recording for m in marks if m.recording not in marked)
+    return AcceptedTrims(marked, already, tuple(not_visible), tuple(by_hand))
+
+
+def _trim_mark(info: RecordingInfo, rows: tuple[int, int], who: str, why: str, how: str) -> Mark:
+    start, stop = rows
+    return Mark(info.id, "trim", who, why, start=start, stop=stop if stop < info.rows else -1, how=how)
 
 
 def kept_rows(trim: Trim, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
@@ -216,25 +217,13 @@ def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why:
             start=start,
             stop=stop,
         )
-    if trim.state == "adjusted" and trim.current_rows() == (start, stop):
-        return False
-    end = stop if stop < info.rows else -1
-    dataset.append_marks([Mark(info.id, "trim", who, why, start=start, stop=end, how=BY_HAND)])
-    return True
+    return bool(dataset.append_marks([_trim_mark(info, (start, stop), who, why, BY_HAND)]))
 
 
 def refresh_trims(dataset: Dataset, trims: Iterable[Trim]) -> list[Trim]:
     """Return ``trims`` with the state by the marks on disk."""
     marks = read_marks(dataset.path)
     return [replace(t, mark_state=marks.get(t.recording.id, MarkState())) for t in trims]
-
-
-def undo_trims(dataset: Dataset, recordings: Sequence[RecordingInfo], who: str, why: str = "") -> tuple[str, ...]:
-    """Undo the trims of ``recordings``, accepted or set by hand; return the ids of those that had one."""
-    marks = read_marks(dataset.path)
-    trimmed = tuple(r.id for r in recordings if marks.get(r.id, MarkState()).trimmed)
-    dataset.append_marks([Mark(identity, "untrim", who, why) for identity in trimmed])
-    return trimmed
 
 
 @dataclass(frozen=True)
@@ -258,22 +247,11 @@ class TrimResult:
         return dict(Counter(t.state for t in self.trims))
 
 
-def decide_trims(
-    dataset: Dataset | str | os.PathLike[str],
-    *,
-    only: str = "*",
-    accept: Sequence[str] = (),
-    above: float | None = None,
-    keep: Sequence[tuple[str, float | None, float | None]] = (),
-    undo: Sequence[str] = (),
-    offset: bool = False,
-    who: str | None = None,
-    why: str = "",
-    progress: Progress | None = None,
-) -> TrimResult:
-    """Suggest trims, and write marks for the given decisions.
+@dataclass(frozen=True)
+class TrimDecisions:
+    """Decisions on trims.
 
-    Args:
+    Attributes:
         only: id or pattern of the recordings to suggest trims for; by default all that are not excluded.
         accept: ids or patterns of the recordings whose suggestion is accepted.
         above: least confidence to accept, 0 to 1; without ``accept``, suggestions for all of ``only`` are accepted.
@@ -281,35 +259,56 @@ def decide_trims(
         undo: ids or patterns of the recordings whose trim is undone.
         offset: whether to accept suggested ends, too.
         who, why: name (by default the login name) and reason for the marks.
+    """
+
+    only: str = "*"
+    accept: Sequence[str] = ()
+    above: float | None = None
+    keep: Sequence[tuple[str, float | None, float | None]] = ()
+    undo: Sequence[str] = ()
+    offset: bool = False
+    who: str | None = None
+    why: str = ""
+
+    def __post_init__(self) -> None:
+        if self.above is not None and not 0.0 <= self.above <= 1.0:
+            raise ConfigError(f"Accepting above {self.above:g}: a confidence from 0 to 1 is accepted.")
+
+
+def decide_trims(
+    dataset: Dataset | str | os.PathLike[str], decisions: TrimDecisions | None = None, progress: Progress | None = None
+) -> TrimResult:
+    """Suggest trims, and write marks for the given decisions.
+
+    Args:
         progress: called with (recordings done, number of recordings).
 
     Raises:
-        ConfigError: for a confidence out of range, or an id in ``keep`` that matches several recordings.
+        ConfigError: for an id in ``keep`` that matches several recordings.
         DatasetError: for unknown recordings, or times outside a recording. In both cases no mark is written.
     """
-    if above is not None and not 0.0 <= above <= 1.0:
-        raise ConfigError(f"Accepting above {above:g}: a confidence from 0 to 1 is accepted.")
-    dataset = as_dataset(dataset)
-    chosen = dataset.used if only == "*" else find_recordings(dataset, only)
+    dataset, d = as_dataset(dataset), decisions or TrimDecisions()
+    chosen = dataset.used if d.only == "*" else find_recordings(dataset, d.only)
     listed = {t.recording.id: t for t in suggest_trims(dataset, chosen, progress)}
-    undone = {r.id: r for pattern in undo for r in find_recordings(dataset, pattern)}
-    by_name = {r.id: r for pattern in accept for r in find_recordings(dataset, pattern)}
+    undone = {r.id: r for pattern in d.undo for r in find_recordings(dataset, pattern)}
+    by_name = {r.id: r for pattern in d.accept for r in find_recordings(dataset, pattern)}
     to_keep = []
-    for identity, start_s, stop_s in keep:
+    for identity, start_s, stop_s in d.keep:
         (info, *others) = find_recordings(dataset, identity)
         if others:
             raise ConfigError(f"One recording is set at a time, and '{identity}' names {1 + len(others)}: give an id.")
         to_keep.append((info, start_s, stop_s))
     more = [r for r in [*by_name.values(), *(i for i, _, _ in to_keep)] if r.id not in listed]
     every = listed | {t.recording.id: t for t in suggest_trims(dataset, more)}
-    rows = [(every[info.id], *kept_rows(every[info.id], start_s, stop_s)) for info, start_s, stop_s in to_keep]
-    accepting = bool(by_name) or above is not None
-    name = author_name(who) if accepting or undone or to_keep else ""
+    rows = [(info, kept_rows(every[info.id], start_s, stop_s)) for info, start_s, stop_s in to_keep]
+    accepting = bool(by_name) or d.above is not None
+    name = author_name(d.who) if accepting or undone or to_keep else ""
     # All arguments are valid: write the marks.
-    undone_ids = undo_trims(dataset, list(undone.values()), name, why)
-    adjusted = tuple(t.recording.id for t, start, stop in rows if set_rows(dataset, t, start, stop, name, why))
+    undoing = dataset.append_marks([Mark(identity, "untrim", name, d.why) for identity in undone])
+    adjusting = dataset.append_marks([_trim_mark(info, kept, name, d.why, BY_HAND) for info, kept in rows])
     accepted = AcceptedTrims()
     if accepting:
         again = refresh_trims(dataset, [every[identity] for identity in (by_name or listed)])
-        accepted = accept_suggestions(dataset, again, name, why, above=above or 0.0, offset=offset)
+        accepted = accept_suggestions(dataset, again, name, d.why, above=d.above or 0.0, offset=d.offset)
+    adjusted, undone_ids = (tuple(mark.recording for mark in marks) for marks in (adjusting, undoing))
     return TrimResult(dataset, tuple(refresh_trims(dataset, listed.values())), accepted, adjusted, undone_ids)

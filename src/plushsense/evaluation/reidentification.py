@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -84,10 +84,6 @@ class ReidentificationTrial:
         """People whose top-1 and precision are both at least `CLEARLY`."""
         return [p for p, share in self.by_person.items() if min(share, self.precision[p]) >= CLEARLY]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True)
 class ReidentificationResult:
@@ -121,13 +117,9 @@ class ReidentificationResult:
             self, trials=tuple(trials), gestures_of_one_person=tuple(map(label, self.gestures_of_one_person))
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
-        lists = {
-            "trials": [t.to_dict() for t in self.trials],
-            "gestures_of_one_person": list(self.gestures_of_one_person),
-        }
-        return {**vars(self), **lists}
+        return asdict(self)
 
 
 def reidentify(
@@ -314,14 +306,13 @@ def verdict(results: ReidentificationResult) -> str:
     return " ".join(sentences.splitlines())
 
 
-def report(results: ReidentificationResult, command: str) -> str:
-    """Return the whole report in Markdown; ``command`` is the command line that it shows for repeating the test."""
+def report(results: ReidentificationResult) -> str:
+    """Return the whole report in Markdown."""
     trial = results.find("recordings", "everything")
     by_person = None if trial is None else sorted(trial.by_person.items(), key=lambda item: (-item[1], item[0]))
     return _fill(
         "reidentification.md.j2",
         found=results,
-        command=command,
         verdict=verdict(results),
         by_person=by_person,
         designs=DESIGNS,

@@ -283,13 +283,13 @@ def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             file, why = Path(key).name, cause.strerror or str(cause)
             raise DatasetError("The key file “{file}” cannot be written: {why}.", file=file, why=why) from None
     options = {name: value for name, value in spec.items() if name not in ("dataset", "place")}
-    options |= {"columns": tuple(spec.get("columns", ())), "key": key}
+    options |= {"key": key}
     return publish_dataset(spec["dataset"], spec["place"], PublishSpec(**options), reporter.stage).to_dict()
 
 
 def run_validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Validate the package ``place``, a folder or a zip; with ``thorough``, all validators read every row."""
-    return validate_package(spec["place"], thorough=spec.get("thorough", False), progress=reporter.stage).to_dict()
+    """Validate the package ``place``, a folder or a zip."""
+    return validate_package(spec["place"], progress=reporter.stage).to_dict()
 
 
 def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:

@@ -142,10 +142,10 @@ def decide(
         checking.parse_acceptance(acceptance)
     if accept:
         marks += checking.acceptances(check_dataset(dataset, limits=limits), accept, who=name, why=why)
-    if marks:
-        dataset.append_marks(marks)
+    marked = dataset.append_marks(marks)
+    if marked:
         dataset = as_dataset(dataset.path)
-    return check_dataset(dataset, only=only, limits=limits, progress=progress), len(marks)
+    return check_dataset(dataset, only=only, limits=limits, progress=progress), len(marked)
 
 
 @dataclass(frozen=True)
@@ -157,14 +157,11 @@ class PublishSpec:
         save: also write these into the data set's ``dataset.toml``.
         streams: also publish the streams of whole sessions, with everything between the gestures.
         excluded: also publish excluded recordings, marked as such.
-        columns: columns of ``subjects.csv`` to publish besides age group and gender.
         key: a file outside the data set, created if absent. Packages made with the same key have the same time shifts;
             without a key they are random.
         pseudonyms: give people new random codes, which are stored in the key.
         reidentification: test whether people can be recognised, and report it in the package.
-        seed: seed of that test.
         published: ISO date of the publication (default: today).
-        thorough: let the slow validators read every row of the streams.
     """
 
     licence: str = ""
@@ -173,13 +170,10 @@ class PublishSpec:
     save: bool = False
     streams: bool = True
     excluded: bool = False
-    columns: tuple[str, ...] = ()
     key: str | os.PathLike[str] | None = None
     pseudonyms: bool = False
     reidentification: bool = True
-    seed: int = 1
     published: str = ""
-    thorough: bool = False
 
 
 def publish_dataset(
@@ -209,11 +203,10 @@ def publish_dataset(
         tested = None
         if spec.reidentification:
             steps = (lambda done, total: progress("recognising people", done, total)) if progress else None
-            found = reidentify(dataset, seed=spec.seed, progress=steps)
+            found = reidentify(dataset, progress=steps)
             found = found.under(public_codes(dataset, contents), public_labels(dataset))
-            command = f"plushsense publish DATASET OUT --seed {spec.seed}"
-            tested = Reidentification(report(found, command), verdict(found), found.to_dict())
-        package = PackageSpec(contents, tested, spec.published, spec.thorough)
+            tested = Reidentification(report(found), verdict(found), found.to_dict())
+        package = PackageSpec(contents, tested, spec.published)
         done = publish(dataset, folder, head, package, progress)
     if spec.save:
         try:
@@ -254,7 +247,7 @@ def share_copy(
 @contextmanager
 def _contents_of(dataset: Dataset, out: Path, spec: PublishSpec) -> Iterator[ContentsSpec]:
     """Yield what to publish; with pseudonyms, hold the lock of the key, which has a code for each person then."""
-    contents = ContentsSpec(spec.streams, spec.excluded, spec.columns, pseudonyms=spec.pseudonyms)
+    contents = ContentsSpec(spec.streams, spec.excluded, pseudonyms=spec.pseudonyms)
     if spec.key is None:
         if spec.pseudonyms:
             raise ConfigError("Pseudonyms need a key, which stores who has which code: give it with --key FILE.")

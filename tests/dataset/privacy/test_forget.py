@@ -330,7 +330,7 @@ def test_no_mark_about_a_removed_person_is_written(folder: Path) -> None:
     with pytest.raises(ForgottenError):
         before.append_marks([Mark("P1/Wave_1000000000000_50", "exclude", "me", "tardy")])
     assert "tardy" not in (folder / MARKS).read_text()
-    open_dataset(folder).append_marks([Mark("P2/Wave_1000000000000_50", "exclude", "me", "tardy")])
+    open_dataset(folder).append_marks([Mark("P2/Wave_1000000000000_50", "include", "me", "tardy")])
     assert "tardy" in (folder / MARKS).read_text()
 
 

@@ -77,13 +77,13 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
             Mark(dataset.streams[0].id, "label", "me", start=2, stop=9, label="practice:01"),
         ],
     )
-    write_people(dataset.path, [PersonInfo("007", "9", "f", "", {"hand": "true", "cm": "14.50"}), PersonInfo("Žanis")])
+    write_people(dataset.path, [PersonInfo("007", "9", "true"), PersonInfo("Žanis")])
     return open_dataset(dataset.path)
 
 
 @pytest.fixture(scope="module")
 def package(source: Dataset, tmp_path_factory: pytest.TempPathFactory) -> PublishResult:
-    return made_of(source, tmp_path_factory.mktemp("out") / "package", ContentsSpec(key=KEY, columns=("hand", "cm")))
+    return made_of(source, tmp_path_factory.mktemp("out") / "package", ContentsSpec(key=KEY))
 
 
 @pytest.fixture(scope="module")
@@ -133,8 +133,8 @@ def test_frictionless_reads_the_zip_itself(package: PublishResult, expected: lis
     assert [(r["subject"], r["gesture"], r["file"]) for r in rows] == expected
     assert opened.get_resource("samples-00000").read_rows()[-1]["x"] == ROWS - 1
     people = {r["subject"]: r for r in opened.get_resource("subjects").read_rows()}
-    assert (people["P007"]["hand"], float(people["P007"]["cm"]), people["P007"]["age_group"]) == (True, 14.5, 9)
-    assert people["Žanis"]["hand"] is None
+    assert (people["P007"]["gender"], people["P007"]["age_group"]) == (True, 9)
+    assert people["Žanis"]["gender"] is None
 
 
 def test_hugging_face_loads_the_folder(
@@ -169,7 +169,7 @@ def test_pandas_polars_and_duckdb_guess_the_same(package: PublishResult, expecte
     root = package.folder
     for name in TABLES:
         path = str(root / f"{name}.csv")
-        keys = ("subject", "gesture", "family", "channel", "file", "session", "excluded", "hand", "cm", "rows")
+        keys = ("subject", "gesture", "family", "channel", "file", "session", "excluded", "gender", "rows")
         frame = pandas.read_csv(path)
         for key in frame.columns.intersection(keys):
             plain = [None if v != v else v for v in frame[key].tolist()]
@@ -189,9 +189,9 @@ def test_pandas_polars_and_duckdb_guess_the_same(package: PublishResult, expecte
 def test_a_value_of_a_person_that_would_be_changed_is_refused(tmp_path: Path) -> None:
     dataset = bring(tmp_path, ("Pat",), ("P1", "P2"))
     for value, other in (("007", ""), ("N/A", "left"), ("TRUE", "")):
-        write_people(dataset.path, [PersonInfo("P1", more={"hand": value}), PersonInfo("P2", more={"hand": other})])
-        with pytest.raises(DatasetError, match=re.escape(f"the hand '{value}'")) as refused:
-            made_of(dataset, tmp_path / "out", ContentsSpec(columns=("hand",)))
+        write_people(dataset.path, [PersonInfo("P1", gender=value), PersonInfo("P2", gender=other)])
+        with pytest.raises(DatasetError, match=re.escape(f"the gender '{value}'")) as refused:
+            made_of(dataset, tmp_path / "out", ContentsSpec())
         assert "subjects.csv" in str(refused.value)
         assert [p.name for p in sorted(tmp_path.iterdir())] == ["DS", "src"]
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import html
 import json
-import lzma
 import re
 import unicodedata
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, cast
+from typing import IO
 from urllib.parse import unquote
 
 import numpy as np
@@ -65,21 +62,15 @@ _WIDE = {"utf-16-le": re.compile(rb"(?:[^\0][\0-\x04]){2,}"), "utf-16-be": re.co
 _ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
 _NUMBERS = b"0123456789;,.+- \t\r\n"
 _MAX_UNPACKED = 1 << 33
-# First bytes of files whose text is compressed in a way that is not read here: zstd, 7z, rar, PDF.
-_UNREAD = (b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"%PDF")
-_UNPACK: dict[bytes, Callable[[IO[bytes]], IO[bytes]]] = {
-    b"\x1f\x8b": lambda file: cast("IO[bytes]", gzip.open(file)),
-    b"BZh": lambda file: cast("IO[bytes]", bz2.open(file)),
-    b"\xfd7zXZ": lambda file: cast("IO[bytes]", lzma.open(file)),
-}
+# First bytes of files whose text is compressed in a way that is not read here: gzip, bzip2, xz, zstd, 7z, rar, PDF.
+_UNREAD = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"%PDF")
 
 
 def texts_in(path: Path) -> Iterator[str]:
     """Yield the text in a file of any kind, piece by piece.
 
     Characters that are escaped as in JSON, HTML or an address are there plainly, too. Of binary files that is what is
-    printable in them, of compressed files and zips what is packed in them, of Parquet
-    and NumPy files the cells that are texts.
+    printable in them, of zips what is packed in them, of Parquet and NumPy files the cells that are texts.
 
     Raises:
         OSError, ValueError: if the file cannot be read, or its text is packed in another way.
@@ -93,17 +84,14 @@ def _texts(file: IO[bytes], depth: int = 0) -> Iterator[str]:
     file.seek(0)
     if depth > 3 or begin.startswith(_UNREAD):
         raise ValueError("its text is packed")
-    unpack = next((call for magic, call in _UNPACK.items() if begin.startswith(magic)), None)
     try:
-        if unpack is not None:
-            yield from _texts(unpack(file), depth + 1)
-        elif begin.startswith(b"PK\x03\x04"):
+        if begin.startswith(b"PK\x03\x04"):
             yield from _packed_texts(file, depth)
         elif begin.startswith((b"PAR1", b"\x93NUMPY")):
             yield from _cells(file, begin.startswith(b"PAR1"))
         else:
             yield from _pieces(file)
-    except (EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as cause:
+    except (EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as cause:
         raise ValueError(f"it is damaged or encrypted ({cause})") from None
 
 

@@ -58,7 +58,7 @@ def _get(table: Any, *path: str | int) -> Any:
 
 StageProgress = Callable[[str, int, int], None]
 EXTRA = "publish"
-# Number of rows of each stream that slow validators read by default.
+# Number of rows of each stream that slow validators read.
 STREAM_ROWS = 1000
 SHOWN = 50
 # Files that PlushSense may add to the data folder when it opens it.
@@ -99,7 +99,7 @@ class ValidationResult:
         """Whether no validator found a problem."""
         return not self.problems
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
         validators, problems = ([vars(each) for each in listed] for listed in (self.validators, self.problems))
         return {"valid": self.valid, "validators": validators, "problems": problems}
@@ -110,7 +110,6 @@ class PackageView:
     """Package under validation, with the problems found by the current validator; slow results are cached."""
 
     root: Path
-    thorough: bool = False
     packed: bool = False
     problems: list[tuple[str, str]] = field(default_factory=list)
     looked_at: str = ""
@@ -150,29 +149,22 @@ class PackageView:
         return not plain.is_absolute() and ".." not in plain.parts
 
 
-def validate_package(
-    package: str | Path, *, thorough: bool = False, progress: StageProgress | None = None
-) -> ValidationResult:
-    """Validate a package (a folder or a zip).
-
-    Args:
-        thorough: whether slow validators read every row of the streams, instead of the first `STREAM_ROWS`.
+def validate_package(package: str | Path, *, progress: StageProgress | None = None) -> ValidationResult:
+    """Validate a package (a folder or a zip); slow validators read the first `STREAM_ROWS` rows of each stream.
 
     Raises:
         DatasetError: if ``package`` is no package.
         MissingExtraError: if a validator is not installed.
     """
     with open_package(Path(package)) as root:
-        return check_folder(root, thorough=thorough, packed=Path(package).is_file(), progress=progress)
+        return check_folder(root, packed=Path(package).is_file(), progress=progress)
 
 
-def check_folder(
-    root: Path, *, thorough: bool = False, packed: bool = False, progress: StageProgress | None = None
-) -> ValidationResult:
+def check_folder(root: Path, *, packed: bool = False, progress: StageProgress | None = None) -> ValidationResult:
     """Validate the folder of a package; ``packed`` is whether it was unpacked from a zip."""
     progress = progress or (lambda stage, done, total: None)
     checked = ValidationResult()
-    package = PackageView(root, thorough, packed)
+    package = PackageView(root, packed)
     for number, (name, validator) in enumerate(VALIDATORS.items()):
         progress(f"validating: {name}", number, len(VALIDATORS))
         began = time.perf_counter()
@@ -240,8 +232,8 @@ def _data(p: PackageView) -> None:
 def _report_private(p: PackageView) -> None:
     """Report private data: author, time and reason of marks, and references to consent forms."""
     folder = p.root / DATA
-    if any(person.consent for person in read_people(folder).values()):
-        p.report(f"{DATA}/{PEOPLE}", "holds references of consent forms, which must not be published")
+    if any(person.consent or person.more for person in read_people(folder).values()):
+        p.report(f"{DATA}/{PEOPLE}", "holds references of consent forms, or other columns, which must not be published")
     path = folder / MARKS
     for number, line in enumerate(path.read_bytes().splitlines() if path.is_file() else (), 1):
         try:
@@ -333,7 +325,7 @@ def _croissant(p: PackageView) -> None:
     issues = loaded.metadata.ctx.issues
     for issue in sorted({*issues.errors, *issues.warnings}, key=str):
         p.report(CROISSANT_FILE, str(issue))
-    records = compare_records(loaded, p.root, None if p.thorough else STREAM_ROWS, p.report)
+    records = compare_records(loaded, p.root, STREAM_ROWS, p.report)
     p.looked_at = ", ".join(f"{n} records of {name}" for name, n in records.items())
 
 
@@ -354,7 +346,7 @@ def _frictionless(p: PackageView) -> None:
     rows = 0
     for resource in package.resources:
         limit = None
-        if resource.path.startswith(f"{DATA}/streams/") and not p.thorough:
+        if resource.path.startswith(f"{DATA}/streams/"):
             # Another validator checks the whole file; the checksum of its first rows would differ.
             limit, resource.hash, resource.bytes = STREAM_ROWS, None, None
         report = resource.validate(limit_rows=limit) if limit else resource.validate()

@@ -11,6 +11,7 @@ import hmac
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from plushsense.core.recorder_csv import (
     read_stream,
     recording_filename,
 )
-from plushsense.core.sentences import Message
+from plushsense.core.sentences import Message, join_names
 from plushsense.dataset.files import walk_files
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
 from plushsense.dataset.marks import MARKS, PRACTICE, Mark, MarkState, mark_line, read_marks
@@ -38,7 +39,6 @@ from plushsense.dataset.publishing.keys import KEPT, PublicationKey
 from plushsense.dataset.publishing.texts import is_misread, label_prefix, public_label
 from plushsense.dataset.store import (
     HEAD,
-    PEOPLE,
     RECORDINGS,
     STREAMS,
     Dataset,
@@ -58,6 +58,8 @@ LATEST_MS = 1_262_304_000_000
 _FAR_MS = 9 * 366 * 86_400_000
 # A 32-bit clock in ms wraps after 49 days; larger values are dates.
 WALL_CLOCK_MS = 2**32
+# What of a recording must be the same in the package.
+_facts_of = attrgetter("gesture", "rows", "first_row", "start", "stop", "excluded")
 
 
 @dataclass(frozen=True)
@@ -108,9 +110,6 @@ def shift_of(subject: str, firsts: list[int], device: bool, key: bytes) -> Shift
     return Shift(min(near, default=0), YEAR_2000_MS + drawn, device)
 
 
-PUBLIC_COLUMNS = ("age_group", "gender")
-
-
 @dataclass(frozen=True)
 class ContentsSpec:
     """What to publish of a data set.
@@ -118,14 +117,12 @@ class ContentsSpec:
     Attributes:
         streams: whether to include the streams of whole sessions.
         excluded: whether to include excluded recordings, marked as such.
-        columns: columns of the people's table besides `PUBLIC_COLUMNS`.
         key: the key of the time shifts and, with ``pseudonyms``, of the new codes; a new one by default.
         pseudonyms: whether people get the codes of ``key`` instead of their own.
     """
 
     streams: bool = True
     excluded: bool = False
-    columns: tuple[str, ...] = ()
     key: PublicationKey = field(default_factory=PublicationKey)
     pseudonyms: bool = False
 
@@ -198,21 +195,10 @@ class ContentsWriter:
         built = build_index(self.folder, self.head)
         published = {r.id: r for r in built.dataset.recordings}
         origin = {ids[r.id]: replace(r, gesture=self.label(r.gesture)) for r in self.kept}
-        if built.unreadable or published.keys() != origin.keys():
-            odd = next(iter([*built.unreadable, *(published.keys() ^ origin.keys())]))
-            raise DatasetError("The package would differ from the data set in '{name}'. Please report it.", name=odd)
-        for identity, before in origin.items():
-            after = published[identity]
-            for key in ("gesture", "rows", "first_row", "start", "stop", "excluded"):
-                if getattr(before, key) != getattr(after, key):
-                    raise DatasetError(
-                        "'{name}' would be published with another {key}: {later!r} instead of {earlier!r}. "
-                        "Please report it.",
-                        name=identity,
-                        key=key,
-                        later=getattr(after, key),
-                        earlier=getattr(before, key),
-                    )
+        odd = [*built.unreadable, *(published.keys() ^ origin.keys())]
+        odd += [name for name, r in origin.items() if name in published and _facts_of(r) != _facts_of(published[name])]
+        if odd:
+            raise DatasetError("The package would differ from the data set in '{name}'. Please report it.", name=odd[0])
         self._note_changes(built.dataset, origin)
         return PackageContents(built.dataset, people, origin, tuple(self.notes))
 
@@ -342,24 +328,14 @@ class ContentsWriter:
 
     def _write_people(self) -> dict[str, PersonInfo]:
         known = read_people(self.source.path)
-        columns = {c for p in known.values() for c in p.more}
-        for column in self.spec.columns:
-            if column not in columns:
-                raise DatasetError(
-                    "{people} has no column '{column}' to publish; besides {public_columns} it has {columns}.",
-                    people=PEOPLE,
-                    column=column,
-                    public_columns=", ".join(PUBLIC_COLUMNS),
-                    columns=", ".join(sorted(columns)) or "none",
-                )
         people = {
-            public: PersonInfo(public, p.age_group, p.gender, "", {c: p.more.get(c, "") for c in self.spec.columns})
+            public: PersonInfo(public, p.age_group, p.gender)
             for code, public in self.codes.items()
             if (p := known.get(code)) is not None
         }
         if people:
             write_people(self.folder, people.values())
-        left_out = len(columns - set(self.spec.columns)) + any(p.consent for p in known.values())
+        left_out = len({c for p in known.values() for c in p.more}) + any(p.consent for p in known.values())
         if left_out:
             # Give only the number, since even the name of a column may be private.
             self.notes.append(Message("Left out: {n:column} of the people's table.", n=left_out))
@@ -389,57 +365,31 @@ class ContentsWriter:
             (self.folder / MARKS).write_text("".join(map(mark_line, marks)), encoding="utf-8", newline="\n")
 
     def _note_changes(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
-        out = [r for r in self.source.recordings if r.excluded]
-        if out and not self.spec.excluded and not self.labelled:
-            template = "Left out: {n:excluded recording}."
-            if self.streams:
-                template = "Left out: {n:excluded recording}. Their rows are still in the session's stream."
-            self.notes.append(Message(template, n=len(out)))
-        elif out:
-            self.notes.append(Message("In the package, but marked as excluded: {n:recording}.", n=len(out)))
-        if self.source.streams and not self.streams:
-            n = len(self.source.streams)
-            self.notes.append(Message("Left out: {n:session stream}.", n=n))
+        excluded = sum(r.excluded for r in self.source.recordings)
+        marked = excluded if self.spec.excluded or self.labelled else 0
+        renamed = 0 if self.spec.pseudonyms else sum(code != public for code, public in self.codes.items())
         trimmed = sum((r.start, r.stop) != (0, r.rows) for r in published.recordings)
-        if trimmed:
-            self.notes.append(
-                Message("Trimmed: {n:recording}; the files hold all rows, start and stop say which remain.", n=trimmed)
-            )
         relabelled = sum(r.gesture != r.recorded for r in published.recordings)
-        if relabelled:
-            self.notes.append(
-                Message(
-                    "Relabelled: {n:recording}; the files are named after the gesture that was asked for, the tables "
-                    "state the one that was made.",
-                    n=relabelled,
-                )
-            )
-        renamed = [code for code, public in self.codes.items() if code != public]
-        if renamed and not self.spec.pseudonyms:
-            self.notes.append(
-                Message(
-                    "Renamed: {n:subject code} that looked like a number or nothing, now with a P in front.",
-                    n=len(renamed),
-                )
-            )
+        lost = sum(origin[r.id].stream_row >= 0 and r.stream_row < 0 for r in published.recordings)
         odd = sorted(r for r in {r.gesture for r in self.kept} if self.label(r) != r)
-        if odd:
-            listed = ", ".join(f"'{label}' is now '{self.label(label)}'" for label in odd)
-            self.notes.append(
-                Message(
-                    "Renamed: gestures that other programs read as a number, a date or no value; {listed}.",
-                    listed=listed,
-                    n=len(odd),
-                )
-            )
-        if self.streams and published.recordings and not self.labelled:
-            lost = sum(origin[r.id].stream_row >= 0 and r.stream_row < 0 for r in published.recordings)
-            if lost:
-                self.notes.append(Message("No longer found in their stream: {n:recording}.", n=lost))
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}{'' if n == 1 else 's'}"
+        left_out = "Left out: {n:excluded recording}."
+        if self.streams:
+            left_out = "Left out: {n:excluded recording}. Their rows are still in the session's stream."
+        notes = {
+            left_out: excluded - marked,
+            "In the package, but marked as excluded: {n:recording}.": marked,
+            "Left out: {n:session stream}.": 0 if self.streams else len(self.source.streams),
+            "Trimmed: {n:recording}; the files hold all rows, start and stop say which remain.": trimmed,
+            "Relabelled: {n:recording}; the files are named after the gesture that was asked for, the tables "
+            "state the one that was made.": relabelled,
+            "Renamed: {n:subject code} that looked like a number or nothing, now with a P in front.": renamed,
+            "Renamed: gestures that other programs read as a number, a date or no value; {listed}.": len(odd),
+            "No longer found in their stream: {n:recording}.": lost if self.streams and not self.labelled else 0,
+        }
+        listed = join_names(f"'{label}' is now '{self.label(label)}'" for label in odd)
+        self.notes += [
+            Message(note, n=n, **({"listed": listed} if "{listed}" in note else {})) for note, n in notes.items() if n
+        ]
 
 
 def _folder_of(file: str) -> str:

@@ -9,6 +9,7 @@ import csv
 import glob
 import itertools
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
 from pathlib import Path
@@ -37,7 +38,7 @@ FILE_FIELD = "file"
 _TYPES = {INTEGER: "cr:Int64", NUMBER: "cr:Float64", TEXT: "sc:Text", YES_NO: "sc:Boolean"}
 
 
-def croissant(d: Description) -> dict[str, Any]:
+def croissant(d: Description) -> dict[str, object]:
     """Return the metadata as JSON-LD; ``d.files`` must contain the tables, whose checksums are included."""
     people = [
         {"@type": "sc:Person", "name": c.name}
@@ -45,7 +46,7 @@ def croissant(d: Description) -> dict[str, Any]:
         | ({"description": c.affiliation} if c.affiliation else {})
         for c in d.creators
     ]
-    document: dict[str, Any] = {
+    document: dict[str, object] = {
         # The context in full instead of its address, so that readers need not fetch it.
         "@context": json.loads(resources.files("plushsense.dataset.publishing").joinpath(CONTEXT).read_text("utf-8")),
         "@type": "sc:Dataset",
@@ -129,38 +130,34 @@ def _field(table: PackageTable, column: TableColumn, extract: dict[str, str] | N
 ReportProblem = Callable[[str, str], None]
 
 
-def compare_records(loaded: Any, root: Path, stream_rows: int | None, report: ReportProblem) -> dict[str, int]:
+def compare_records(loaded: Any, root: Path, stream_rows: int, report: ReportProblem) -> dict[str, int]:
     """Load every record set, compare each value with its text in the files, and return the number of compared records.
 
     Args:
         loaded: the `mlcroissant.Dataset` of the package in ``root``; which files its streams include is changed.
-        stream_rows: number of rows to compare from the beginning of each stream; None for all.
+        stream_rows: number of rows to compare from the beginning of each stream.
         report: called with a file and its problem.
     """
     by_id = {node.uuid: node for node in loaded.metadata.distribution}
-    samples = {top: _files(root, top) for top in (RECORDINGS, STREAMS)}
-    unloaded = {file for files in samples.values() for file in files}
-    compared = {}
+    unloaded, compared = {*_files(root, RECORDINGS), *_files(root, STREAMS)}, Counter[str]()
     for record_set in loaded.metadata.record_sets:
         name = record_set.uuid
         source = by_id[next(f.source.uuid for f in record_set.fields)]
         if type(source).__name__ == "FileObject":
-            compared[name] = _compare(name, loaded.records(name), root, [source.content_url], None, report)
-            continue
-        files = samples[STREAMS if name == "stream-samples" else RECORDINGS]
-        unloaded -= set(files)
-        if stream_rows is None or name == "samples":
-            compared[name] = _compare(name, loaded.records(name), root, files, None, report)
-            continue
-        compared[name] = 0
-        for file in files:
-            # Load one file at a time, so that only its beginning is parsed.
-            source.includes = [glob.escape(file)]
-            records = itertools.islice(iter(loaded.records(name)), stream_rows)
-            compared[name] += _compare(name, records, root, [file], stream_rows, report)
+            parts: list[list[str]] = [[source.content_url]]
+        else:
+            # Load one stream at a time, so that only its beginning is parsed.
+            parts = [_files(root, RECORDINGS)] if name == "samples" else [[file] for file in _files(root, STREAMS)]
+        for files in parts:
+            limit = stream_rows if name == "stream-samples" else None
+            if limit is not None:
+                source.includes = [glob.escape(files[0])]
+            records = itertools.islice(iter(loaded.records(name)), limit)
+            compared[name] += _compare(name, records, root, files, limit, report)
+            unloaded -= set(files)
     for file in sorted(unloaded):
         report(file, "is in no record set of croissant.json")
-    return compared
+    return dict(compared)
 
 
 def _files(root: Path, top: str) -> list[str]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -217,8 +216,6 @@ LICENCE = "LICENSE.txt"
 REIDENTIFICATION = "reidentification.md"
 REIDENTIFICATION_JSON = "reidentification.json"
 
-Rows = Sequence[tuple[str, ...]]
-
 
 def fill_template(template: str, d: Description, **values: Any) -> str:
     """Fill a template of this folder with the description and ``values``."""
@@ -231,76 +228,18 @@ def readme(d: Description, reidentification: str | None) -> str:
     return fill_template(
         "README.md.j2",
         d,
-        facts=_facts(d),
-        files=_files(d, reidentification is not None),
-        columns=[(f"`{c.name}`", c.unit, c.text) for c in samples.columns],
-        gestures=_gestures(d),
         findings=_findings(d),
         reidentification=reidentification,
         samples=samples,
         samples_table="streams.csv" if d.dataset.layout.is_labelled else "recordings.csv",
-        tables=", ".join(f"`{t.name}`" for t in d.tables),
-        configs=[json.dumps(_config(t), ensure_ascii=False) for t in d.tables],
-        features=[json.dumps(_features(t), ensure_ascii=False) for t in d.tables if t.files],
         sample_folder=f"{DATA}/{STREAMS if d.dataset.layout.is_labelled else RECORDINGS}",
+        dtypes={INTEGER: "int64", NUMBER: "float64", TEXT: "string"},
         DATA=DATA,
         REIDENTIFICATION=REIDENTIFICATION,
     )
 
 
-_DTYPES = {INTEGER: "int64", NUMBER: "float64", TEXT: "string"}
-
-
-def _config(table: PackageTable) -> dict[str, Any]:
-    """Return the configuration under which `datasets.load_dataset` of Hugging Face loads a table."""
-    default = {"default": True} if table.name == "recordings" else {}
-    return {"config_name": table.name, "data_files": table.file or table.glob} | default
-
-
-def _features(table: PackageTable) -> dict[str, Any]:
-    """Return the types of the columns, which would otherwise be those of the first file: of 1 where another has 1.5."""
-    features = [{"name": column.name, "dtype": _DTYPES[column.kind]} for column in table.columns]
-    return {"config_name": table.name, "features": features}
-
-
-def _facts(d: Description) -> Rows:
-    data = d.dataset
-    seconds = sum(s.seconds for s in data.streams)
-    duration = f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds / 60:.1f} min"
-    return [
-        ("version", f"{d.version}, {d.published}"),
-        ("made by", "; ".join(c.name for c in d.creators)),
-        ("people", str(len(data.subjects))),
-        ("recordings", str(len(data.recordings))),
-        ("gestures", f"{d.gestures_made}, of {len(data.gestures)} in the set"),
-        ("session streams", f"{len(data.streams)}, {duration}" if data.streams else "none"),
-        ("sensors", f"{data.layout.title}: {data.layout.n_channels} channels, nominally {data.layout.rate_hz:g} Hz"),
-    ]
-
-
-def _files(d: Description, reidentification: bool) -> Rows:
-    rows = [(f"`{t.file or t.glob}`", t.text + (f", {len(t.files)} files" if t.files else "")) for t in d.tables]
-    return [
-        *rows,
-        (f"`{DATA}/`", "a PlushSense data set: the recordings with layout, gesture set and marks"),
-        ("`croissant.json`", "metadata for machine learning (Croissant 1.1)"),
-        ("`datapackage.json`, `schemas/`", "metadata of the tables (Frictionless)"),
-        ("`datacite.json`", "metadata for a DOI (DataCite 4.5)"),
-        *([(f"`{REIDENTIFICATION}`, `.json`", "whether people can be recognised")] if reidentification else []),
-        ("`checksums.sha256`", "of all files; check with  `sha256sum -c checksums.sha256`"),
-    ]
-
-
-def _gestures(d: Description) -> Rows:
-    rows = []
-    for g in d.dataset.gestures.gestures:
-        mine = [r for r in d.dataset.recordings if r.gesture == g.label]
-        free = " (free choice: everybody did something else)" if g.free_choice else ""
-        rows.append((g.label + free, g.affect, g.family, str(len(mine)), str(len({r.subject for r in mine}))))
-    return rows
-
-
-def _findings(d: Description) -> Rows:
+def _findings(d: Description) -> list[tuple[str, str]]:
     counts: Counter[str] = Counter()
     for flags in [r.flags for r in d.dataset.recordings] + [s.flags for s in d.dataset.streams]:
         counts.update({_kind(flag) for flag in flags})

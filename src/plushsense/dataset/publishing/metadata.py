@@ -20,9 +20,9 @@ SCHEMA_VERSION = "http://datacite.org/schema/kernel-4"
 UNAVAILABLE = ":unav"
 
 
-def datacite(d: Description) -> dict[str, Any]:
+def datacite(d: Description) -> dict[str, object]:
     """Return the DataCite metadata (schema 4)."""
-    document: dict[str, Any] = {
+    document: dict[str, object] = {
         "schemaVersion": SCHEMA_VERSION,
         "types": {"resourceTypeGeneral": "Dataset", "resourceType": "Touch gesture recordings"},
         "creators": [_person(c) for c in d.creators],
@@ -76,12 +76,12 @@ DATAPACKAGE_FILE = "datapackage.json"
 SCHEMAS = "schemas"
 
 
-def schemas(d: Description) -> dict[str, dict[str, Any]]:
+def schemas(d: Description) -> dict[str, dict[str, object]]:
     """Return the Frictionless schema of each table, by the path of its file."""
     return {_schema_path(table): _schema(table) for table in d.tables}
 
 
-def datapackage(d: Description) -> dict[str, Any]:
+def datapackage(d: Description) -> dict[str, object]:
     """Return the Frictionless descriptor of the package; ``d.files`` must contain the tables."""
     resources = []
     for table in d.tables:
@@ -103,7 +103,7 @@ def datapackage(d: Description) -> dict[str, Any]:
                     "schema": _schema_path(table),
                 }
             )
-    document: dict[str, Any] = {
+    document: dict[str, object] = {
         "profile": "tabular-data-package",
         "name": d.name,
         "title": d.title,
@@ -127,8 +127,8 @@ def _schema_path(table: PackageTable) -> str:
     return f"{SCHEMAS}/{table.name}.json"
 
 
-def _schema(table: PackageTable) -> dict[str, Any]:
-    made: dict[str, Any] = {"fields": [_field(table, c) for c in table.columns], "missingValues": [""]}
+def _schema(table: PackageTable) -> dict[str, object]:
+    made: dict[str, object] = {"fields": [_field(table, c) for c in table.columns], "missingValues": [""]}
     if table.key:
         made["primaryKey"] = [table.key]
     keys = [
@@ -152,7 +152,7 @@ def _field(table: PackageTable, column: TableColumn) -> dict[str, Any]:
     return made
 
 
-def write_json(path: Path, table: dict[str, Any]) -> None:
+def write_json(path: Path, table: dict[str, object]) -> None:
     """Write a JSON file of the package."""
     write_text(path, json.dumps(table, ensure_ascii=False, indent=1) + "\n")
 

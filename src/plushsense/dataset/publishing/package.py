@@ -8,13 +8,11 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from plushsense.core.errors import DatasetError, need
 from plushsense.core.files import new_folder
@@ -22,7 +20,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.core.sentences import Message
 from plushsense.dataset.about import Contact
-from plushsense.dataset.index import open_dataset
+from plushsense.dataset.index import open_dataset, write_index_files
 from plushsense.dataset.publishing.checking import EXTRA, StageProgress, ValidationResult, check_folder
 from plushsense.dataset.publishing.contents import (
     ContentsSpec,
@@ -69,7 +67,7 @@ class Reidentification:
 
     report: str
     short: str
-    figures: dict[str, Any]
+    figures: dict[str, object]
 
 
 @dataclass
@@ -90,7 +88,7 @@ class PublishResult:
         """Whether every validator accepts the package."""
         return self.checked.valid
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
         d = self.description
         return {
@@ -209,13 +207,11 @@ class PackageSpec:
         contents: what to publish of the data set.
         reidentification: None leaves the report out, which the README then states.
         published: the day of publication in ISO format; today by default.
-        thorough: as in `validate_package`.
     """
 
     contents: ContentsSpec = field(default_factory=ContentsSpec)
     reidentification: Reidentification | None = None
     published: str = ""
-    thorough: bool = False
 
 
 def publish(
@@ -242,16 +238,20 @@ def publish(
     spec = spec or PackageSpec()
     progress = progress or (lambda step, done, total: None)
     target = check_output_folder(dataset, out)
-    with _removed_on_failure() as made, new_folder(out, DatasetError, finishing=dataset.generation.writing) as work:
-        contents = ContentsWriter(dataset, work / DATA, head, spec.contents, partial(progress, "writing")).write()
-        d = _write_metadata(work, dataset, contents, spec)
-        if spec.contents.pseudonyms:
-            refuse_traces(work, person_codes(dataset))
-        checked = check_folder(work, thorough=spec.thorough, progress=progress)
-        if checked.valid:
-            missing = not target.exists()
-            write_zip(work, target, dataset.generation.writing)
-            made += [target] * missing
+    with ExitStack() as failed:
+        with new_folder(out, DatasetError, finishing=dataset.generation.writing) as work:
+            contents = ContentsWriter(dataset, work / DATA, head, spec.contents, partial(progress, "writing")).write()
+            d = _write_metadata(work, dataset, contents, spec)
+            if spec.contents.pseudonyms:
+                refuse_traces(work, person_codes(dataset))
+            checked = check_folder(work, progress=progress)
+            if checked.valid:
+                existed = target.exists()
+                write_zip(work, target, dataset.generation.writing)
+                if not existed:
+                    # A zip without its folder would be in the way of the next call, or have a person removed since.
+                    failed.callback(target.unlink, missing_ok=True)
+        failed.pop_all()
     files = list_package_files(out)
     return PublishResult(
         out,
@@ -265,21 +265,6 @@ def publish(
     )
 
 
-@contextmanager
-def _removed_on_failure() -> Iterator[list[Path]]:
-    """Yield a list, and remove the files in it if an error ends the block.
-
-    A zip without its folder would be in the way of the next call, and may contain a person removed since.
-    """
-    made: list[Path] = []
-    try:
-        yield made
-    except BaseException:
-        for path in made:
-            path.unlink(missing_ok=True)
-        raise
-
-
 @dataclass(frozen=True)
 class CopyResult:
     """Copy of a data set with shifted times; ``notes`` state what was left out or changed."""
@@ -288,7 +273,7 @@ class CopyResult:
     files: int
     notes: tuple[Message, ...]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
         return {
             "out": str(self.dataset.path),
@@ -314,6 +299,8 @@ def copy_dataset(dataset: Dataset, out: Path, spec: ContentsSpec, progress: Stag
         if spec.pseudonyms:
             refuse_traces(work, person_codes(dataset))
         files = len(list_package_files(work))
+        # Without an index, opening the copy would write one, and leave the file of its lock there.
+        write_index_files(contents.dataset)
     return CopyResult(open_dataset(out), files, contents.notes)
 
 
@@ -355,50 +342,37 @@ def _write_texts(work: Path, d: Description, source: Dataset, reidentification: 
 
 
 def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[Message]:
-    warnings = []
-    groups = Counter((p.age_group, p.gender, *p.more.values()) for p in people.values() if p.age_group or p.gender)
+    groups = Counter((p.age_group, p.gender) for p in people.values() if p.age_group or p.gender)
     rare = sum(n for n in groups.values() if n < FEWEST_ALIKE)
-    if rare:
-        warnings.append(
-            Message(
-                "{n} people have an age group and gender that fewer than {least} people share, which alone may "
-                "identify them: use coarser groups in subjects.csv",
-                n=rare,
-                least=FEWEST_ALIKE,
-            )
-        )
     without_digit = [s for s in d.dataset.subjects if not any(c.isdigit() for c in s)]
-    if without_digit:
-        n, code = len(without_digit), without_digit[0]
-        warnings.append(
-            Message(
-                "subject codes are published as they are, and {n} hold no digit ('{code}'): if they are names, give "
-                "--pseudonyms",
-                n=n,
-                code=code,
-            )
-        )
-    if d.licence.travels and not any((source.path / name).is_file() for name in _LICENCE_FILES):
-        licence = d.licence.spdx
-        warnings.append(
-            Message(
-                "{licence} requires its text in every copy: put it into the data set as LICENSE.txt", licence=licence
-            )
-        )
-    if not d.about.title:
-        warnings.append(
-            Message(
-                "the published title is the data set's name, '{name}', often that of the imported folder: check it, "
-                "or set title in [about] in dataset.toml",
-                name=source.head.name,
-            )
-        )
-    if not d.about.creators:
-        warnings.append(
-            Message("nobody is named as creator, so the contact is: add creators to [about] in dataset.toml")
-        )
-    if any(r.subject == UNKNOWN_SUBJECT for r in d.dataset.recordings):
-        warnings.append(Message("the people of some recordings are not known, so they share one time shift"))
-    if not {r.subject for r in d.dataset.recordings} - {NOBODY, UNKNOWN_SUBJECT}:
-        warnings.append(Message("no recording has a known person"))
-    return warnings
+    subjects = {r.subject for r in d.dataset.recordings}
+    own_licence = any((source.path / name).is_file() for name in _LICENCE_FILES)
+    warnings = {
+        Message(
+            "{n} people have an age group and gender that fewer than {least} people share, which alone may "
+            "identify them: use coarser groups in subjects.csv",
+            n=rare,
+            least=FEWEST_ALIKE,
+        ): rare > 0,
+        Message(
+            "subject codes are published as they are, and {n} hold no digit ('{code}'): if they are names, give "
+            "--pseudonyms",
+            n=len(without_digit),
+            code=next(iter(without_digit), ""),
+        ): bool(without_digit),
+        Message(
+            "{licence} requires its text in every copy: put it into the data set as LICENSE.txt", licence=d.licence.spdx
+        ): d.licence.travels and not own_licence,
+        Message(
+            "the published title is the data set's name, '{name}', often that of the imported folder: check it, "
+            "or set title in [about] in dataset.toml",
+            name=source.head.name,
+        ): not d.about.title,
+        Message(
+            "nobody is named as creator, so the contact is: add creators to [about] in dataset.toml"
+        ): not d.about.creators,
+        Message("the people of some recordings are not known, so they share one time shift"): UNKNOWN_SUBJECT
+        in subjects,
+        Message("no recording has a known person"): not subjects - {NOBODY, UNKNOWN_SUBJECT},
+    }
+    return [warning for warning, applies in warnings.items() if applies]

@@ -26,7 +26,6 @@ from plushsense.dataset.publishing.description import (
     DATA,
     TEXT,
     PackageTable,
-    TableColumn,
     sample_columns,
 )
 from plushsense.dataset.publishing.texts import changed_text, kind_of
@@ -51,10 +50,8 @@ def build_tables(contents: PackageContents) -> list[tuple[PackageTable, str]]:
     for name, its_rows in rows.items():
         table = load_table(known[name] | {"name": name}, PackageTable, "tables.toml", DatasetError)
         if name == "subjects":
-            more = dict.fromkeys(key for p in contents.people.values() for key in p.more)
-            own = tuple(TableColumn(key, TEXT, "as given by those who recorded") for key in more)
             code, *given, recordings, sessions = table.columns
-            given = [replace(c, kind=kind_of(str(row[c.name]) for row in its_rows)) for c in (*given, *own)]
+            given = [replace(c, kind=kind_of(str(row[c.name]) for row in its_rows)) for c in given]
             table = replace(table, columns=(code, *given, recordings, sessions))
         _refuse_changed(table, its_rows)
         made.append((table, _text(table, its_rows)))
@@ -133,13 +130,12 @@ def _streams(d: Dataset) -> Iterable[Row]:
 
 def _people(contents: PackageContents) -> Iterable[Row]:
     d = contents.dataset
-    more = dict.fromkeys((key for p in contents.people.values() for key in p.more), "")
     # List "none" and "unknown" too, so that every reference can be resolved.
     for code in sorted({r.subject for r in d.recordings} | {s.subject for s in d.streams}):
         mine = [r for r in d.recordings if r.subject == code]
         person = contents.people.get(code, PersonInfo(code))
         counts = {"recordings": len(mine), "sessions": len({r.session for r in mine})}
-        yield more | person.more | vars(person) | {"subject": code} | counts
+        yield vars(person) | {"subject": code} | counts
 
 
 def _gestures(d: Dataset) -> Iterable[Row]:

@@ -146,7 +146,7 @@ class CheckReport:
             "accepted": dict(Counter(f.check for f in self.findings if f.accepted)),
         }
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON."""
         return {
             "ok": self.ok,
@@ -321,14 +321,12 @@ def author_name(who: str | None) -> str:
 def exclusions(
     dataset: Dataset, exclude: Sequence[str] = (), include: Sequence[str] = (), *, who: str, why: str
 ) -> list[Mark]:
-    """Return marks for the recordings to exclude or include, given as ids or patterns; without those already so."""
-    excluded = {r.id: r.excluded for r in dataset.recordings}
+    """Return marks for the recordings to exclude or include, given as ids or patterns."""
     return [
         Mark(identity, action, who, why)
         for action, patterns in (("exclude", exclude), ("include", include))
         for pattern in patterns
-        for identity in match_ids(pattern, excluded, "recording")
-        if excluded[identity] == (action == "include")
+        for identity in match_ids(pattern, [r.id for r in dataset.recordings], "recording")
     ]
 
 
@@ -352,7 +350,7 @@ def acceptances(checked: CheckReport, accept: Sequence[str], *, who: str, why: s
         if not present:
             raise DatasetError(f"The check '{check}' found nothing, so there is nothing to accept.")
         ids = [""] if not pattern and "" in present else match_ids(pattern, present, f"finding of '{check}' about")
-        marks += [Mark(i, "accept", who, why, check=check) for i in ids if not present[i].accepted]
+        marks += [Mark(i, "accept", who, why, check=check) for i in ids]
     return marks
 
 

@@ -37,10 +37,6 @@ def _ranges(rows: NDArray[np.int64], s: Examination, length: int = 1) -> tuple[t
     return tuple((int(r) + s.first_row, int(r) + s.first_row + length) for r in rows[:_SHOWN])
 
 
-def _plural(n: int, noun: str) -> str:
-    return f"{n} {noun}{'s' if n > 1 else ''}"
-
-
 def _weight(share: float, limits: CheckLimits) -> Severity | None:
     """Return the severity for a share of bad rows; few do no harm, since readers repeat the last valid value."""
     return "error" if share > limits.garbage else "info" if share < _FEW else None

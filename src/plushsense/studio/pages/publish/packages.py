@@ -16,12 +16,11 @@ from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.publishing.checking import VALIDATORS
-from plushsense.dataset.publishing.contents import PUBLIC_COLUMNS
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE
 from plushsense.dataset.publishing.description import CHECKSUMS, REIDENTIFICATION_JSON
 from plushsense.dataset.publishing.keys import is_drawn
 from plushsense.dataset.publishing.tables import list_package_files
-from plushsense.dataset.store import Dataset, read_people
+from plushsense.dataset.store import Dataset
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, set_address, tag
@@ -84,14 +83,12 @@ class DatasetFacts:
 
     Attributes:
         dataset: the data set, or None if it cannot be read; ``problem`` is then the reason.
-        columns: columns of the table of people that are published only on request.
         own_codes: codes of people that were not drawn at random.
     """
 
     path: Path
     dataset: Dataset | None = None
     problem: PlushSenseError | None = None
-    columns: tuple[str, ...] = ()
     own_codes: tuple[str, ...] = ()
 
     @classmethod
@@ -99,14 +96,11 @@ class DatasetFacts:
         """Read the facts of a data set; store an error as ``problem``."""
         try:
             dataset = open_dataset(path)
-            people = read_people(path)
         except PlushSenseError as refusal:
             return cls(path, problem=refusal)
-        columns = {c for p in people.values() for c in p.more} - set(PUBLIC_COLUMNS)
         return cls(
             path,
             dataset,
-            columns=tuple(sorted(columns)),
             own_codes=tuple(s for s in dataset.subjects if not is_drawn(s)),
         )
 
@@ -317,7 +311,6 @@ class PackagesSection:
                 self._validators(job.result)
                 for each in job.result.get("sentences", ()):
                     notice(words.sentence(each), "info")
-            self._thorough = tag(ui.checkbox(words("Slow validators read every row of the sessions")), "check-thorough")
             check = button("check", words("Check again"), lambda: self._check(package), icon="fact_check")
             check.set_enabled("publish" not in self.lacking)
 
@@ -341,8 +334,7 @@ class PackagesSection:
     async def _check(self, package: PackageFacts) -> None:
         self.page.say("")
         with self.page.show_errors():
-            spec = {"place": str(self.workspace.inside(package.place)), "thorough": bool(self._thorough.value)}
-            await self.work.start("validate", spec)
+            await self.work.start("validate", {"place": str(self.workspace.inside(package.place))})
 
     def _contents(self, package: PackageFacts) -> None:
         words = self.words

@@ -26,7 +26,6 @@ _SWITCHES: Texts = {
     "streams": "Also publish whole sessions",
     "excluded": "Also publish excluded recordings",
     "reidentification": "Test whether people can be recognised",
-    "thorough": "Slow validators read every row of the sessions",
 }
 
 _SWITCHES_ABOUT: Texts = {
@@ -34,9 +33,6 @@ _SWITCHES_ABOUT: Texts = {
     "excluded": "They are marked. If whole sessions are published, these contain the rows in any case.",
     "reidentification": (
         "A simple program tries to recognise people by their touch. The package states how often it was right."
-    ),
-    "thorough": (
-        "Takes some minutes more for a large data set. By default they read the first 1000 rows of each session."
     ),
 }
 
@@ -170,10 +166,6 @@ class _Publishing:
                 ),
                 "missing-baselines",
             )
-        self._columns: dict[str, ui.checkbox] = {}
-        if chosen.columns:
-            text(words("Columns of the table of people to publish besides age group and gender:"), classes="ps-dim")
-            self._columns = {c: tag(ui.checkbox(c), f"column-{c}") for c in chosen.columns}
         if chosen.own_codes:
             codes = ", ".join(chosen.own_codes[:_MAX_CODES]) + (" …" if len(chosen.own_codes) > _MAX_CODES else "")
             simulated = chosen.dataset is not None and chosen.dataset.head.simulated
@@ -246,7 +238,6 @@ class _Publishing:
                 "dataset": str(dataset),
                 "place": str(place),
                 **{key: bool(box.value) for key, box in self._switches.items()},
-                "columns": [name for name, box in self._columns.items() if box.value],
                 "key": str(key) if self._keep.value else "",
                 "pseudonyms": bool(self._pseudonyms.value),
             }
