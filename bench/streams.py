@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 from typing import Any
 
@@ -23,7 +23,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
 from plushsense.experiments.streams.score import CHOICES
 from plushsense.experiments.streams.systems import ANYWHERE
-from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.config import from_settings
 
 RECALLS = (0.3, 0.4, 0.5, 0.6, 0.7)
 
@@ -35,7 +35,6 @@ class Row:
     title: str
     system: str = ANYWHERE
     pool_s: float | None = None
-    anywhere: dict[str, float] = field(default_factory=dict)
 
 
 ROWS = {
@@ -43,7 +42,6 @@ ROWS = {
     "windows-hysteresis": Row("gestures only, hysteresis", system="hysteresis"),
     "smoothed": Row("anywhere, smoothed argmax", system="anywhere-smoothed"),
     "easy": Row("anywhere, hysteresis"),
-    "hard": Row("anywhere, hysteresis, hard negatives", anywhere={"hard_share": 0.15}),
     "pool-0.8": Row("anywhere, hysteresis, pool 0.8 s", pool_s=0.8),
     "pool-0.5": Row("anywhere, hysteresis, pool 0.5 s", pool_s=0.5),
 }
@@ -72,13 +70,8 @@ def main() -> None:
         print(json.dumps({"seeds": seeds, "rows": table}))
 
 
-def config_of(row: Row, seed: int) -> RunConfig:
-    config = from_settings(seed=seed)
-    return replace(config, anywhere=replace(config.anywhere, **row.anywhere))
-
-
 def benchmark(dataset: Dataset, row: Row, seed: int, workers: int) -> dict[str, Any]:
-    config = config_of(row, seed)
+    config = from_settings(seed=seed)
     config = replace(config, evaluation=replace(config.evaluation, workers=workers))
     # The reference is needed for the interpolation at equal recall.
     systems = list(dict.fromkeys(["smoothed", row.system]))

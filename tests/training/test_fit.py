@@ -19,7 +19,7 @@ from plushsense.windows.cut import WindowSet
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
 from plushsense.training.engine import Adam, FitState
-from plushsense.training.fit import fit, predict, with_hard_negatives
+from plushsense.training.fit import fit, predict
 
 pytestmark = pytest.mark.apart("trainings")
 
@@ -262,31 +262,3 @@ def test_a_training_that_stops_early_goes_on_as_well(made: Make, tmp_path: Path,
         went_on = fit(train, validation, arch(), spec, start=FitState.from_arrays(journal.load("stopped")))
         assert (went_on.history, went_on.best_epoch) == (whole.history, whole.best_epoch)
         assert all(np.array_equal(values, went_on.weights[name]) for name, values in whole.weights.items())
-
-
-def test_hard_negatives_are_the_idle_windows_that_look_like_a_gesture(made: Make) -> None:
-    idle = 2
-    train, easy = made(60), made(60, seed=4)
-    easy = easy.take(np.flatnonzero(easy.y == idle))
-    # Gestures that nobody marked: windows of class 0 that are labelled as idle.
-    hard = made(60, seed=5)
-    hard = hard.take(np.flatnonzero(hard.y == 0))
-    hard = replace(hard, y=np.full_like(hard.y, idle))
-    candidates = easy.joined(hard)
-    assert len(candidates) == len(easy) + len(hard) and candidates.integers.shape[1:] == easy.integers.shape[1:]
-    names = [candidates.recording_ids[r] for r in candidates.recording]
-    assert names == [w.recording_ids[r] for w in (easy, hard) for r in w.recording]
-    spec = replace(SPEC, epochs=25)
-    more = with_hard_negatives(train, candidates, idle, (0, 1), arch(), spec, share=0.1)
-    added = more.take(np.arange(len(train), len(more)))
-    assert (
-        0 < len(added) <= 6 and np.array_equal(more.integers[: len(train)], train.integers) and set(added.y) == {idle}
-    )
-    assert all(any(np.array_equal(x, other) for other in hard.integers) for x in added.integers)
-    # What is no reaction may be reported.
-    assert with_hard_negatives(train, hard, idle, (1,), arch(), spec, share=0.1).integers.shape == train.integers.shape
-    # Gestures among the candidates are ignored, and with no share nothing is trained.
-    assert (
-        with_hard_negatives(train, made(30, seed=6).take(np.arange(0)), idle, (0, 1), arch(), spec, share=0.1) is train
-    )
-    assert with_hard_negatives(train, candidates, idle, (0, 1), arch(), spec, share=0.0) is train

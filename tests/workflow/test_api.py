@@ -233,13 +233,12 @@ def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:
 )
 def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path: Path) -> None:
     from plushsense.workflow.config import resolve
-    from plushsense.workflow.preparation import prepare, split_validation
+    from plushsense.workflow.preparation import prepare_training
 
     dataset = long_recordings(tmp_path, people, 4)
-    windows = ps.cut_windows(dataset)
-    assert len(windows) == 6 * len(dataset.recordings), "several windows a recording"
-    division = split_validation(windows, prepare(dataset, resolve(None)))
-    trained, scored = (set(windows.recording[i].tolist()) for i in (division.train, division.fold.test))
+    made = prepare_training(dataset, resolve(None))
+    assert len(made.windows) == 6 * len(dataset.recordings), "several windows a recording"
+    trained, scored = (set(made.windows.recording[i].tolist()) for i in (made.train, made.fold.test))
     assert trained
     assert scored
     assert not trained & scored

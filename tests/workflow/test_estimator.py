@@ -395,7 +395,11 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
         model.predict(holes)
     with pytest.raises(ArrayError, match=r"\(60, 60, 2\): expected .* give np.swapaxes"):
         model.predict(x.swapaxes(1, 2))
-    for weights, match in ((np.ones(59), "sample_weight.shape"), (-np.ones(60), "Negative"), (np.zeros(60), "non-zero|0 class")):
+    for weights, match in (
+        (np.ones(59), "shape"),
+        (-np.ones(60), "Negative"),
+        (np.zeros(60), "non-zero|0 class"),
+    ):
         with pytest.raises(ValueError, match=match):
             model.fit(x, y, sample_weight=weights)
 

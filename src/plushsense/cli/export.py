@@ -73,7 +73,7 @@ def _patch(args: argparse.Namespace) -> int:
             words = f"--{option.replace('_', '-')}"
             raise ConfigError(f"{words} is for a whole export: a patch holds no names or versions, so leave it out.")
     done = export_patch(args.bundle, args.out, export=args.patch_for, dataset=args.dataset, warn=warn)
-    emit(args, done.to_dict(), [f"{done.path}: {done.bytes:,} bytes, for plush_patch on a toy with {args.patch_for}"])
+    emit(args, done.to_json(), [f"{done.path}: {done.bytes:,} bytes, for plush_patch on a toy with {args.patch_for}"])
     return 0
 
 

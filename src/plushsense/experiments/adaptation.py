@@ -555,7 +555,7 @@ def evaluate_adapting(
         use, random: as for `ChoiceSpec`.
         int8: also score the deployed networks, before and after.
     """
-    run = prepare(dataset, config or from_settings(**settings), warn)
+    run = prepare(dataset, from_settings(config, **settings), warn)
     spec = spec or PersonalSpec()
     if use < spec.least or random < 0:
         raise ConfigError(f"--use {use}, --choices {random}: accepted are {spec.least} and more, 0 and more.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 
@@ -35,9 +35,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 Weights = dict[str, NDArray[np.float32]]
-
-# Probability of a gesture from which an idle window is hard.
-_HARD = 0.3
 
 
 @dataclass(frozen=True)
@@ -258,41 +255,6 @@ def predict(
     with repeatable(), torch_threads(1):
         reader = engine(arch, net, place, 1, 1)
         return np.asarray(F.softmax(reader.logits(x), dim=1).cpu().numpy())
-
-
-def with_hard_negatives(
-    train: WindowSet,
-    candidates: WindowSet,
-    idle: int,
-    reactions: Sequence[int],
-    arch: Arch,
-    spec: TrainSpec,
-    share: float,
-    progress: EpochProgress | None = None,
-) -> WindowSet:
-    """Return the training windows with hard negatives: idle windows that a first network takes for a gesture.
-
-    Most idle windows are easy, and evenly spaced ones hold few of those at which a network reports a gesture for no
-    reason. A network is trained on ``train`` and computes the candidates of class ``idle``, which must be of the
-    training people. Those in which the classes of ``reactions`` together have a probability of at least 0.3 are added,
-    the highest first.
-
-    Args:
-        candidates: windows of the same classes; those of other classes are ignored. Windows that are in ``train``
-            already may be among them, and then count twice.
-        reactions: indices of the classes that must not be reported for no reason.
-        share: largest number of added windows, as a share of ``train``.
-        progress: as for `fit`.
-    """
-    at = np.flatnonzero(candidates.y == idle)
-    most = int(share * len(train))
-    if not len(at) or not most:
-        return train
-    first = fit(train, None, arch, spec, progress)
-    shares = predict(arch, first.weights, first.scaler, candidates.take(at), spec.device)
-    gesture = shares[:, list(reactions)].sum(axis=1)
-    hardest = np.argsort(-gesture, kind="stable")[:most]
-    return train.joined(candidates.take(at[hardest[gesture[hardest] >= _HARD]]))
 
 
 def _measure(row: EpochRow, net: Engine, data: tuple[Windows, Tensor] | None, windows: WindowSet | None) -> None:

@@ -30,19 +30,11 @@ from plushsense.models.bundle import Bundle
 from plushsense.scoring.metrics import summary
 from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
-from plushsense.workflow.api import evaluate_run, train, unfinished
+from plushsense.workflow.api import FoldsSpec, evaluate_run, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.networks import REFIT
-from plushsense.workflow.preparation import (
-    Run,
-    Warn,
-    count_people,
-    prepare,
-    refits,
-    refuse_hard_negatives,
-    silent,
-)
+from plushsense.workflow.preparation import Run, Warn, count_people, prepare, refits, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, journal_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -69,7 +61,7 @@ class TrainingCost:
         windows: number of windows of all people.
         side_by_side: number of folds that are trained at the same time.
         networks: number of trainings that the final network takes: 2 if people are first held out for its decision
-            settings, else 1; twice as many if another network finds hard negatives for each.
+            settings, else 1.
     """
 
     window_epoch_s: float
@@ -280,13 +272,11 @@ class _Making:
         self._began = time.monotonic()
         self._dataset, self._out, self._config = dataset, out, config
         self._budget_s, self._progress, self._warn = budget_s, progress, warn
-        run = prepare(dataset, config)
-        refuse_hard_negatives(run)
         self._again = refits(config, count_people(dataset))
         self._networks = 1 + self._again
         # A resumed run must not choose other folds because the computer is faster or slower than before.
         self._journal = journal_of(dataset, "budgets")
-        self._key = job_id({"evaluation": run.id, "out": out.name, "seconds": budget_s})
+        self._key = job_id({"evaluation": prepare(dataset, config).id, "out": out.name, "seconds": budget_s})
 
     @property
     def _seconds(self) -> float:
@@ -357,7 +347,7 @@ class _Making:
             return fold_done
 
         started = time.monotonic()
-        result = evaluate_run(run, out=out, progress=reported(EVALUATING, 1.0), warn=self._warn)
+        result = evaluate_run(run, FoldsSpec(out), progress=reported(EVALUATING, 1.0), warn=self._warn)
         evaluation_s = time.monotonic() - started
         before += plan.folds - 1
         points = {plan.trained_people: _accuracies(result.scores)}
@@ -366,7 +356,7 @@ class _Making:
             if not resumed and share * evaluation_s > self._budget_s - self._seconds:
                 break
             progress = reported(LEARNING_CURVE, share)
-            smaller = evaluate_run(run, training_people=size, progress=progress, warn=silent)
+            smaller = evaluate_run(run, FoldsSpec(people=size), progress=progress, warn=silent)
             points[size] = _accuracies(smaller.scores)
             before += (plan.folds - 1) * share
         return learning_curve(points)

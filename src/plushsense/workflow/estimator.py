@@ -24,7 +24,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE
-from plushsense.training.spec import PADDING, EpochRow, TrainSpec, preset
+from plushsense.training.spec import PADDING, EpochRow, preset
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import InputUnits
 
@@ -404,7 +404,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         x = to_integers(x, layout)
         order = in_own_order(x, index, *([people] if groups is not None else []))
         x, index, weights = x[order], index[order].astype(np.int64), weights[order]
-        people = np.arange(len(x)).astype(str) if groups is None else people[order]
+        people = np.asarray(np.arange(len(x)) if groups is None else people[order]).astype(str)
         windows = windows_of(x, index, people, layout, gestures_of(classes))
         held_back = np.zeros(len(x), dtype=bool)
         if spec.patience is not None and len(names := np.unique(people)) > 1:

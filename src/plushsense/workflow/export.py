@@ -97,9 +97,10 @@ def training_windows(
                 name=dataset.head.name,
             )
         )
-    known = {field.name for field in fields(WindowSpec)}
-    spec = WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
-    anywhere = AnywhereSpec(**bundle.windowing.get("anywhere", {}))
+    # Keys of earlier versions are left out.
+    tables = (bundle.windowing, WindowSpec), (bundle.windowing.get("anywhere", {}), AnywhereSpec)
+    known = [{f.name: table[f.name] for f in fields(kind) if f.name in table} for table, kind in tables]
+    spec, anywhere = WindowSpec(**known[0]), AnywhereSpec(**known[1])
     windows = windows_for(dataset, bundle.arch, spec, bundle.gestures, warn, anywhere)
     at = np.flatnonzero(np.isin(windows.subject, sorted(people)))
     if not len(at):
@@ -171,7 +172,7 @@ class SavedWindows:
     bytes: int
     windows: dict[str, int]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the object that ``plushsense evaluate --save-windows --json`` prints."""
         return {"file": str(self.path), "bytes": self.bytes, "windows": self.windows}
 
@@ -181,7 +182,6 @@ def save_windows(
     path: str | os.PathLike[str],
     config: RunConfig | None = None,
     *,
-    split: str | None = None,
     overwrite: bool = False,
     warn: Warn = python_warning,
     **settings: Any,
@@ -193,8 +193,7 @@ def save_windows(
     them ``trainrecordings`` and so on (ids, which begin with the person), and ``simulated``.
 
     Args:
-        config, settings: as for `api.evaluate`.
-        split: a split with one fold, such as "windows:file-order" or "recordings:holdout".
+        config, settings: as for `api.evaluate`; the split must have one fold, as "windows:file-order" has.
         overwrite: replace an existing file.
 
     Raises:
@@ -203,12 +202,11 @@ def save_windows(
         MissingExtraError: if SciPy is not installed.
     """
     path = Path(path)
-    given = config or from_settings(**settings)
     if path.suffix != ".mat":
         raise ConfigError(f"'{path}' is no name of a MATLAB file: give one that ends in .mat.")
     if path.exists() and not overwrite:
         raise ConfigError(f"'{path}' exists already: give the name of a new file, or replace it with --force.")
-    run = prepare(dataset, given if split is None else given.for_split(split), warn)
+    run = prepare(dataset, from_settings(config, **settings), warn)
     windows = run.scored_windows(warn)
     folds = fold_windows(windows, windows, run.split, run.evaluation.seed)
     if len(folds) > 1:
@@ -245,7 +243,7 @@ class PatchResult:
     bytes: int
     image_check: int
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the object that ``plushsense export --patch-for --json`` prints."""
         return {"patch": str(self.path), "bytes": self.bytes, "image_check": self.image_check}
 

@@ -16,7 +16,7 @@ from plushsense.jobs.journal import Journal, job_id, keep_if_possible
 from plushsense.models.arch import Arch
 from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.windows.cut import WindowSet
-from plushsense.workflow.preparation import Run, add_hard_negatives, outside_streams
+from plushsense.workflow.preparation import Run, outside_streams
 
 if TYPE_CHECKING:
     from plushsense.training.engine import FitState
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 # Age at which unfinished trainings are deleted: most are never resumed, and they contain data on people.
 KEPT_S = 30 * 24 * 3600.0
 _SAVE_EVERY_S = 0.5
-FIRST_NETWORK, REFIT = "first network", "training again, on everybody"
-"""``what`` of the rows of a network that finds hard negatives, and of one that is trained again on everybody."""
+REFIT = "training again, on everybody"
+"""``what`` of the rows of a network that is trained again on everybody."""
 
 
 class ResumableTraining:
@@ -110,26 +110,17 @@ class NetworkTrainer:
 
         run, spec, network = self.run, self.run.training, self.run.network
 
-        def reporting(*names: str) -> EpochProgress:
-            def report(epoch: int, epochs: int, row: EpochRow) -> None:
-                whole = ", ".join(name for name in (*names, row.get("what")) if name)
-                self.progress(epoch, epochs, {**row, "what": whole} if whole else row)
-
-            return report
+        def epoch_done(epoch: int, epochs: int, row: EpochRow) -> None:
+            whole = ", ".join(name for name in (what, row.get("what")) if name)
+            self.progress(epoch, epochs, {**row, "what": whole} if whole else row)
 
         if self.by_people:
             # Decisions are fitted on whole streams of the others, which may contain recordings at rest.
             at = at[outside_streams(self.windows, run.dataset, others)[at]]
         train_on = self.windows.take(at)
-        if self.by_people:
-            train_on = add_hard_negatives(
-                train_on, run.dataset, network, run.windows, run.anywhere, run.gestures, spec,
-                others, reporting(what, FIRST_NETWORK),
-            )  # fmt: skip
         state = None if self.journal is None else ResumableTraining(self.journal, network, spec, train_on, watched)
         self._states.extend([state] if state else [])
         start = state.load() if state else None
-        epoch_done = reporting(what)
         for row in start.history if start is not None else ():
             epoch_done(row["epoch"], spec.epochs, row)
         fitted = fit(
