@@ -36,12 +36,6 @@ def test_plush_15_is_table_1_of_the_paper() -> None:
     assert load_layout("accel-3").valid_min_int[0] < -6992, "at rest an axis reads -6992"
 
 
-@pytest.mark.parametrize("name", layout_names())
-def test_a_layout_travels_as_plain_values(name: str) -> None:
-    layout = load_layout(name)
-    assert Layout.from_dict(layout.to_dict()) == layout
-
-
 def test_a_users_own_layout(tmp_path: Path) -> None:
     path = tmp_path / "pad.toml"
     path.write_text(OWN)

@@ -19,7 +19,7 @@ from plushsense.windows.cut import WindowSet
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
 from plushsense.training.engine import Adam, FitState
-from plushsense.training.fit import fit, predict
+from plushsense.training.fit import StoreSpec, fit, predict
 
 pytestmark = pytest.mark.apart("trainings")
 
@@ -216,7 +216,7 @@ def test_the_number_of_threads_is_put_back(made: Make) -> None:
 
 def test_a_long_training_passes_through_the_end_of_a_short_one(made: Make) -> None:
     spec = replace(SPEC, epochs=4, halve_every=None, patience=None)
-    long = fit(made(40), None, arch(), spec, keep=(2, 4))
+    long = fit(made(40), None, arch(), spec, store=StoreSpec(keep=(2, 4)))
     short = fit(made(40), None, arch(), replace(spec, epochs=2))
     assert sorted(long.kept) == [2, 4]
     for name, values in short.weights.items():
@@ -228,25 +228,23 @@ def test_a_long_training_passes_through_the_end_of_a_short_one(made: Make) -> No
 def test_a_training_goes_on_as_if_it_had_never_stopped(made: Make, tmp_path: Path, padding: str) -> None:
     spec = replace(SPEC, epochs=7, halve_every=2, patience=None, augment=("random-rotation:20",))
     train = replace(made(50), vectors=())
-    whole = fit(train, made(20, seed=4), arch(padding=padding), spec, keep=(3, 5))
+    whole = fit(train, made(20, seed=4), arch(padding=padding), spec, store=StoreSpec(keep=(3, 5)))
     saved: list[FitState] = []
-    short = fit(
-        train, made(20, seed=4), arch(padding=padding), replace(spec, epochs=3), keep=(3,), save=saved.append,
-        save_every_s=0.0,
-    )  # fmt: skip
+    store = StoreSpec(keep=(3,), save=saved.append, save_every_s=0.0)
+    short = fit(train, made(20, seed=4), arch(padding=padding), replace(spec, epochs=3), store=store)
     assert [state.epoch for state in saved] == [1, 2, 3]
     journal = Journal(tmp_path)
     journal.save("short", short.state.to_arrays())  # type: ignore[union-attr]
     state = FitState.from_arrays(journal.load("short"))
     assert state.epoch == 3
-    went_on = fit(train, made(20, seed=4), arch(padding=padding), spec, keep=(3, 5), start=state)
+    went_on = fit(train, made(20, seed=4), arch(padding=padding), spec, store=StoreSpec(state, (3, 5)))
     assert went_on.history == whole.history
     assert sorted(went_on.kept) == sorted(whole.kept) == [3, 5]
     for name, values in whole.weights.items():
         assert np.array_equal(values, went_on.weights[name])
         assert all(np.array_equal(whole.kept[epoch][name], went_on.kept[epoch][name]) for epoch in (3, 5))
     with pytest.raises(TrainingError, match="leave patience out"):
-        fit(train, made(20, seed=4), arch(padding=padding), replace(spec, patience=3), start=state)
+        fit(train, made(20, seed=4), arch(padding=padding), replace(spec, patience=3), store=StoreSpec(state))
 
 
 @pytest.mark.parametrize("stop_on", ["loss", "accuracy"])
@@ -254,11 +252,12 @@ def test_a_training_that_stops_early_goes_on_as_well(made: Make, tmp_path: Path,
     spec = replace(SPEC, epochs=40, learning_rate=0.05, patience=3, stop_on=stop_on)
     train, validation, journal = made(30), made(20, seed=4), Journal(tmp_path)
     states: list[FitState] = []
-    whole = fit(train, validation, arch(), spec, save=states.append, save_every_s=0.0)
+    whole = fit(train, validation, arch(), spec, store=StoreSpec(save=states.append, save_every_s=0.0))
     assert len(whole.history) == whole.best_epoch + 3 < 40
     # Stopped after any epoch, also between the best one and the end.
     for state in states:
         journal.save("stopped", state.to_arrays())
-        went_on = fit(train, validation, arch(), spec, start=FitState.from_arrays(journal.load("stopped")))
+        store = StoreSpec(FitState.from_arrays(journal.load("stopped")))
+        went_on = fit(train, validation, arch(), spec, store=store)
         assert (went_on.history, went_on.best_epoch) == (whole.history, whole.best_epoch)
         assert all(np.array_equal(values, went_on.weights[name]) for name, values in whole.weights.items())

@@ -38,13 +38,13 @@ def _conversion(entry: ConversionFacts) -> str:
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.workflow.export import export
+    from plushsense.workflow.export import PackageNames, export
 
     if args.patch_for is not None:
         return _patch(args)
     also = listed(args.also)
-    package = {"name": args.name, "model_version": args.model_version, "url": args.url}
-    done = export(args.bundle, args.out, dataset=args.dataset, also=also, **package, warn=warn)
+    package = PackageNames(args.name, args.model_version, args.url)
+    done = export(args.bundle, args.out, dataset=args.dataset, also=also, package=package, warn=warn)
     facts = done.facts
     simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts.simulated else []
     emit(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, NamedTuple, NoReturn, cast, get_args
+from typing import Any, Literal, NamedTuple, NoReturn, TypedDict, Unpack, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -259,6 +259,18 @@ class VectorLayer:
         return 3 * self.vectors * self.filters * self.kernel
 
 
+class ArchSettings(TypedDict, total=False):
+    """The settings of `Arch` that have a default and are no layers."""
+
+    channels: int
+    classes: int
+    padding: str
+    norm: str
+    window: int
+    step: int
+    pool: int | None
+
+
 @dataclass(frozen=True)
 class Arch:
     """The structure of a network, without its weights.
@@ -325,22 +337,11 @@ class Arch:
 
     @classmethod
     def parse(
-        cls,
-        spec: str,
-        filters: str | Sequence[int],
-        *,
-        channels: int = 11,
-        classes: int = 18,
-        padding: str = "stream",
-        norm: str = "batch",
-        window: int = 250,
-        step: int = 5,
-        pool: int | None = None,
-        vectors: int = 1,
+        cls, spec: str, filters: str | Sequence[int], *, vectors: int = 1, **settings: Unpack[ArchSettings]
     ) -> Arch:
         """Build a network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra ones are ignored).
 
-        ``vectors`` is their number, besides gravity, for a symbol with a vector layer.
+        ``vectors`` is their number, besides gravity, for a symbol with a vector layer; ``settings`` are the others.
 
         Raises:
             ArchError: for an invalid symbol (with a caret under the character) or setting.
@@ -364,7 +365,7 @@ class Arch:
         if shape.vector is not None:
             vector, counts = VectorLayer(shape.vector, counts[0], vectors), counts[1:]
         layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape.layers, counts, strict=False))
-        return cls(layers, channels, classes, cast(Padding, padding), cast(Norm, norm), window, step, pool, vector)
+        return cls(layers, vector=vector, **cast(Any, settings))
 
     @property
     def symbol(self) -> str:

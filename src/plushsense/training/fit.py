@@ -47,7 +47,7 @@ class FittedNetwork:
             while training), validation_loss and validation_accuracy (None without validation) over all windows,
             validation_accuracy_people (see `accuracy_over_people`), learning_rate.
         best_epoch: the epoch of ``weights``.
-        kept: weights after each epoch in ``keep``.
+        kept: weights after each epoch in `StoreSpec.keep`.
         state: state to continue the training from; None with early stopping.
     """
 
@@ -60,16 +60,31 @@ class FittedNetwork:
     state: FitState | None = None
 
 
+@dataclass(frozen=True)
+class StoreSpec:
+    """What of a training is stored, and the state that it continues from.
+
+    Attributes:
+        start: state to continue from, with the same windows and settings but more epochs; the result is bit for bit
+            that of an uninterrupted training.
+        keep: epochs after which a copy of the weights is stored. With a constant learning rate, these equal the weights
+            of trainings with fewer epochs.
+        save: called with the state every ``save_every_s`` seconds.
+    """
+
+    start: FitState | None = None
+    keep: Collection[int] = ()
+    save: Callable[[FitState], None] | None = None
+    save_every_s: float = 60.0
+
+
 def fit(
     train: WindowSet,
     validation: WindowSet | None,
     arch: Arch,
-    spec: TrainSpec | None = None,
+    spec: TrainSpec,
     progress: EpochProgress | None = None,
-    keep: Collection[int] = (),
-    start: FitState | None = None,
-    save: Callable[[FitState], None] | None = None,
-    save_every_s: float = 60.0,
+    store: StoreSpec | None = None,
     weights: NDArray[np.float64] | None = None,
 ) -> FittedNetwork:
     """Train a network; the same seed gives the same weights.
@@ -77,10 +92,6 @@ def fit(
     Args:
         train: windows to train on.
         validation: windows that decide when to stop; None or empty: train all epochs.
-        keep: epochs after which a copy of the weights is stored. With a constant learning rate, these equal the weights
-            of trainings with fewer epochs.
-        start: state to continue from, with the same windows and settings but more epochs; the result is bit for bit
-            that of an uninterrupted training. ``save`` is called with one every ``save_every_s`` seconds.
         weights: how often each window of ``train`` counts in an epoch, (N,). Whole numbers give the same network as
             windows that are repeated; of fractions, each epoch draws whether the window counts once more.
 
@@ -88,7 +99,7 @@ def fit(
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
     """
     began = saved = time.perf_counter()
-    spec = spec or TrainSpec()
+    store = store or StoreSpec()
     validation = validation if validation is not None and len(validation) else None
     _check(train, arch, "train on")
     _check(validation, arch, "validate on")
@@ -100,7 +111,7 @@ def fit(
     with torch.random.fork_rng(devices=[]), repeatable(allow_tf32=True), torch_threads(threads):
         channels = Channels(train.vectors, scaler, device, arch.vector is not None)
         most = len(train) if weights is None else int(np.ceil(weights.sum()))
-        training = _Training(arch, spec, channels, most, val_data is not None, start)
+        training = _Training(arch, spec, channels, most, val_data is not None, store.start)
         with closing(training.net):
             for epoch in range(len(training.history) + 1, spec.epochs + 1):
                 rate = spec.learning_rate_at(epoch)
@@ -110,14 +121,14 @@ def fit(
                 row["learning_rate"] = rate
                 _refuse_not_finite(row, spec)
                 training.history.append(row)
-                if epoch in keep:
+                if epoch in store.keep:
                     training.kept[epoch] = training.net.export_weights()
                 if progress is not None:
                     progress(epoch, spec.epochs, row)
                 if training.is_over(row):
                     break
-                if save is not None and time.perf_counter() - saved >= save_every_s:
-                    save(training.state())
+                if store.save is not None and time.perf_counter() - saved >= store.save_every_s:
+                    store.save(training.state())
                     saved = time.perf_counter()
             return training.finished(scaler, time.perf_counter() - began)
 

@@ -42,12 +42,11 @@ from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possibl
 from plushsense.jobs.pool import JobsSpec
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle, is_training_content, known_people
-from plushsense.models.reference import softmax
+from plushsense.models.bundle import Bundle, is_training_content
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
-from plushsense.windows.cut import ANYWHERE, WindowSet, whole_gestures
+from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.networks import KEPT_S, REFIT, NetworkTrainer, TrainedNetwork
 from plushsense.workflow.preparation import (
@@ -59,7 +58,6 @@ from plushsense.workflow.preparation import (
     prepare_training,
     warn_of_files_twice,
     warn_of_single_people,
-    windows_for,
 )
 from plushsense.workflow.reporting import check_place, journal_of, save_evaluation
 
@@ -247,8 +245,7 @@ def train(
     if fit_decisions:
         reader = replace(bundle, weights=checked.weights, scaler=checked.fitted.scaler)
         bundle = replace(bundle, decision=_decisions(reader, dataset, run.live, warn))
-    if made.refit:
-        # What the network that did not know the validation people answered, for `validation_predictions`.
+    if made.kind == WHOLE_PEOPLE:
         kept = journal_of(dataset, _PREDICTIONS)
         kept.prune(KEPT_S)
         keep_if_possible(kept, _predictions_id(bundle), {**vars(predictions)})
@@ -451,36 +448,25 @@ def evaluate_run(
 def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[str]) -> Predictions:
     """Return what a network answered on the recordings of its validation people, as `train` scored it.
 
-    If the network in the bundle was then trained on everybody (``refit``), these are the stored answers of the one
-    before, which are kept for 30 days; otherwise they are computed. Recordings at rest are left out.
+    The answers are kept for 30 days; those of a network that was then trained on everybody (``refit``) are of the one
+    before. Recordings at rest are left out.
 
     Raises:
-        DatasetError: if the bundle has no validation people or their answers are gone, the data set was changed since
-            the training (reason ``data_changed``), or has none of their recordings.
+        DatasetError: if the bundle has no validation people or their answers are gone, or the data set was changed
+            since the training.
     """
     dataset = as_dataset(dataset)
-    people = known_people(bundle.provenance, ["validation_subjects"])
-    stored = journal_of(dataset, _PREDICTIONS).find(_predictions_id(bundle)) if bundle.provenance.get("refit") else None
-    lost = bundle.provenance.get("refit") and stored is None
-    if bundle.provenance.get("split") != WHOLE_PEOPLE or not people or lost:
+    stored = journal_of(dataset, _PREDICTIONS).find(_predictions_id(bundle))
+    if bundle.provenance.get("split") != WHOLE_PEOPLE or stored is None:
         raise DatasetError("This network has no validation people: evaluate it instead.")
     if not is_training_content(bundle, dataset):
         raise DatasetError(
             "The data set '{name}' was changed since this network was trained: evaluate it instead.",
             name=dataset.head.name,
         )
-    if stored is not None:
-        known = ~np.isin(stored["subject"], [NOBODY, UNKNOWN_SUBJECT])
-        arrays = {key: value[known] for key, value in stored.items() if key != "labels"}
-        return Predictions(labels=tuple(stored["labels"]), **arrays)
-    dataset = dataset.with_inputs(bundle.layout).with_gestures(bundle.gestures)
-    # All recordings are cut, because how long a gesture usually is depends on them.
-    every = windows_for(dataset, bundle.arch, whole_gestures(bundle.windowing), bundle.gestures)
-    windows = every.take(np.flatnonzero(np.isin(every.subject, list(people))))
-    network = bundle.network()
-    parts = [windows.integers[at : at + _BATCH] for at in range(0, len(windows), _BATCH)]
-    logits = np.concatenate([network.forward(bundle.scaler.apply(part)) for part in parts])
-    return gather_predictions(windows, [("validation", np.arange(len(windows)))], [softmax(logits).astype(np.float32)])
+    known = ~np.isin(stored["subject"], [NOBODY, UNKNOWN_SUBJECT])
+    arrays = {key: value[known] for key, value in stored.items() if key != "labels"}
+    return Predictions(labels=tuple(stored["labels"]), **arrays)
 
 
 def load(path: str | os.PathLike[str]) -> Bundle:

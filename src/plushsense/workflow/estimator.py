@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from hashlib import blake2b
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -46,6 +47,7 @@ _MOST_REPEATS = 10.0
 # this many samples. Accuracy on makeability, 5 folds by person, 30 epochs, one seed, of half and of the whole window:
 # 0.477 and 0.457 with 100 samples, 0.388 and 0.383 with 60.
 _SHORTEST_FIELD = 16
+_PEOPLE = ("subjects", "validation_subjects")
 # The settings that are used only in training.
 _TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
 
@@ -244,6 +246,14 @@ def gestures_of(classes: NDArray[Any], known: GestureSet | None = None) -> Gestu
     return GestureSet(known.name if known is not None else ANONYMOUS, gestures, inferred=known is None)
 
 
+def _labels_table(classes: NDArray[Any]) -> dict[str, Any]:
+    """Return the labels of ``classes`` in the form that a bundle stores and `labels_from` restores."""
+    values = classes.tolist()
+    plain = all(isinstance(v, str | int | float) for v in values)
+    dtype = classes.dtype.str if plain and classes.dtype.kind != "O" else "O"
+    return {"labels": values if plain else [str(v) for v in values], "dtype": dtype}
+
+
 def labels_from(bundle: Bundle) -> NDArray[Any]:
     """Restore the class labels of a bundle with their type; without a stored table, return its gestures' labels.
 
@@ -378,21 +388,11 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         times those of ``class_weight``, are scaled so that their mean is from 1 to 10. They have no effect on
         validation.
         """
-        from sklearn.utils.validation import _check_sample_weight
-
         from plushsense.training.fit import fit
 
         layout = self._known_layout()
         x, labels = self._windows(X, y, layout)
-        rows = x.reshape(len(x), -1)
-        weights = _check_sample_weight(sample_weight, rows, dtype=np.float64, ensure_non_negative=True)
-        # Without groups, each window counts as another person.
-        people = np.arange(len(x)) if groups is None else np.asarray(groups)
-        if people.shape != (len(x),):
-            raise ArrayError(f"groups has the shape {people.shape}: expected ({len(x)},), one a window.")
-        some = weights > 0.0
-        x, labels, people, weights = x[some], labels[some], people[some].astype(str), weights[some]
-        weights = balanced_by_class(weights, labels, self.class_weight)
+        x, labels, people, weights = self._weighted(x, labels, groups, sample_weight)
         classes, index = np.unique(labels, return_inverse=True)
         if len(classes) < 2:
             listed = ", ".join(map(str, classes))
@@ -404,7 +404,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         x = to_integers(x, layout)
         order = in_own_order(x, index, *([people] if groups is not None else []))
         x, index, weights = x[order], index[order].astype(np.int64), weights[order]
-        people = np.asarray(np.arange(len(x)) if groups is None else people[order]).astype(str)
+        people = people[order] if groups is not None else np.arange(len(x)).astype(str)
         windows = windows_of(x, index, people, layout, gestures_of(classes))
         held_back = np.zeros(len(x), dtype=bool)
         if spec.patience is not None and len(names := np.unique(people)) > 1:
@@ -419,10 +419,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             spec,
             weights=None if (trained == 1.0).all() else trained * scaling,
         )
-        subjects, validators = (
-            [] if groups is None else sorted(set(people[part].tolist())) for part in (~held_back, held_back)
-        )
-        plain = all(isinstance(label, str | int | float) for label in classes.tolist())
+        parts = () if groups is None else (~held_back, held_back)
         self.classes_, self.history_ = classes, fitted.history
         self.bundle_ = Bundle(
             arch=arch,
@@ -434,15 +431,10 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             decision=DecideSpec().to_dict(),
             provenance={
                 "dataset": "arrays given to PlushClassifier",
-                "estimator": {
-                    "settings": self._settings(),
-                    "labels": classes.tolist() if plain else [str(label) for label in classes.tolist()],
-                    "dtype": classes.dtype.str if plain and classes.dtype.kind != "O" else "O",
-                },
+                "estimator": {"settings": self._settings(), **_labels_table(classes)},
                 "windows": len(x),
                 "weighted": bool((trained != 1.0).any()),
-                "subjects": subjects,
-                "validation_subjects": validators,
+                **dict(zip_longest(_PEOPLE, [sorted(set(people[part].tolist())) for part in parts], fillvalue=[])),
                 "split": "none",
                 "preset": self.preset,
                 "training": spec.to_dict(),
@@ -451,6 +443,22 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             calibration=calibration(arch, fitted.weights, fitted.scaler, windows.integers[~held_back]),
         )
         return self
+
+    def _weighted(
+        self, x: NDArray[Any], labels: NDArray[Any], groups: ArrayLike | None, sample_weight: ArrayLike | None
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.str_], NDArray[np.float64]]:
+        """Return windows, labels, people and weights of the windows with a weight above 0."""
+        from sklearn.utils.validation import _check_sample_weight
+
+        rows = x.reshape(len(x), -1)
+        weights = _check_sample_weight(sample_weight, rows, dtype=np.float64, ensure_non_negative=True)
+        # Without groups, each window counts as another person.
+        people = np.asarray(np.arange(len(x)) if groups is None else groups)
+        if people.shape != (len(x),):
+            raise ArrayError(f"groups has the shape {people.shape}: expected ({len(x)},), one a window.")
+        some = weights > 0.0
+        weights = balanced_by_class(weights[some], labels[some], self.class_weight)
+        return x[some], labels[some], people[some].astype(str), weights
 
     def _windows(self, X: ArrayLike, y: ArrayLike, layout: Layout | None) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return windows (N, C, T) and labels (N,) that scikit-learn has checked."""

@@ -58,8 +58,7 @@ def training_windows(
 ) -> NDArray[np.int32]:
     """Cut the integer windows (N, C, T) of the people on whom a bundle was trained, with the settings of the training.
 
-    Args:
-        dataset: the data set of the training; ``warn`` is called if its content has changed since then.
+    ``warn`` is called if the content of the data set has changed since then.
 
     Raises:
         ArchError: for a network that cannot be deployed.
@@ -84,8 +83,7 @@ def training_windows(
     if dataset.layout.inputs != bundle.layout.inputs or dataset.layout.period_us != bundle.layout.period_us:
         raise BundleError(
             "The data set '{name}' has the layout '{layout}', the bundle '{bundle_layout}': give the data set that "
-            "it was "
-            "trained on.",
+            "it was trained on.",
             name=dataset.head.name,
             layout=dataset.layout.name,
             bundle_layout=bundle.layout.name,
@@ -116,15 +114,29 @@ def training_windows(
     return windows.integers[at]
 
 
+@dataclass(frozen=True)
+class PackageNames:
+    """What an export is called.
+
+    Attributes:
+        name: prefix of all names in the C code, its files and packages, so that several exports link into one program.
+        model_version: version of the model, for the manifests and the C code; by default that in the bundle, or that
+            of PlushSense.
+        url: web page of the model, for the manifests; by default an address that leads nowhere.
+    """
+
+    name: str = ""
+    model_version: str = ""
+    url: str = ""
+
+
 def export(
     bundle: Bundle | str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
     dataset: Dataset | str | os.PathLike[str] | None = None,
     also: Sequence[str] = (),
-    name: str = "",
-    model_version: str = "",
-    url: str = "",
+    package: PackageNames | None = None,
     warn: Warn = python_warning,
 ) -> ExportResult:
     """Write the files that a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
@@ -134,10 +146,7 @@ def export(
         out: a new or empty folder.
         dataset: the data set of the training, to calibrate on; required if the bundle has no calibration.
         also: formats for other runtimes (`plushsense.deploy.convert.CONVERTERS`), such as ``onnx``.
-        name: prefix of all names in the C code, its files and packages, so that several exports link into one program.
-        model_version: version of the model, for the manifests and the C code; by default that in the bundle, or that
-            of PlushSense.
-        url: web page of the model, for the manifests; by default an address that leads nowhere.
+        package: what the code and the packages are called.
         warn: called with a sentence for everything unusual.
 
     Raises:
@@ -147,7 +156,8 @@ def export(
             version or address that is not accepted.
         BadInput: for a folder that is not empty.
     """
-    check_names(name, url=url, model_version=model_version)
+    package = package or PackageNames()
+    check_names(package.name, url=package.url, model_version=package.model_version)
     for other in also:
         check_format(other)
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
@@ -159,9 +169,10 @@ def export(
             windows = training_windows(given, dataset, warn)
             windows = windows[:: -(-len(windows) // _TRIED)]
         given = calibrated_on(given, dataset, warn if windows is None else silent)
-    if model_version:
-        given = replace(given, provenance=given.provenance | {"model_version": model_version})
-    return emit(integer_model(given), given, Path(out), name=name, url=url, also=also, windows=windows)
+    if package.model_version:
+        given = replace(given, provenance=given.provenance | {"model_version": package.model_version})
+    names = {"name": package.name, "url": package.url}
+    return emit(integer_model(given), given, Path(out), **names, also=also, windows=windows)
 
 
 @dataclass(frozen=True)
