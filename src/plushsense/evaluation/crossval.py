@@ -259,15 +259,27 @@ def evaluate(
     folds = folds if spec.validation else train_on_validation(folds)
     hashes = [windows_fingerprint(train)]
     hashes.append(hashes[0] if score is train else windows_fingerprint(score))
-    outcomes = run_study(
+    return run_study(
         [StudyPart(fold.name, {"fold": fold_fingerprint(fold)}, fold) for fold in folds],
         _FoldWork(fit_predict),
-        lambda study: study.results,
+        lambda study: _result(study.results, folds, (train, score), split, spec.seed, shared_rows),
         key={"version": _VERSION, "key": dict(spec.key or {}), "windows": hashes},
         shared=(train, None if score is train else score),
         spec=spec.jobs,
         progress=progress,
     )
+
+
+def _result(
+    outcomes: Sequence[Result],
+    folds: Sequence[Fold],
+    windows: tuple[WindowSet, WindowSet],
+    split: Split,
+    seed: int,
+    shared_rows: SharedRows,
+) -> EvaluationResult:
+    """Score the outcomes of all folds; ``windows`` are those to train on and those that were scored."""
+    train, score = windows
     records = [
         FoldRecord(
             fold.name,
@@ -293,7 +305,7 @@ def evaluate(
         split=split,
         context=context_of(score),
         train_context=context_of(train),
-        seeds=[spec.seed],
+        seeds=[seed],
         scores=scores,
         leakage=audit_leakage(train, score, folds, shared_rows()),
         self_calibration=score.self_calibration,

@@ -214,18 +214,15 @@ def train(
     those of whole gestures with the real signal before them.
 
     Args:
-        config: settings; alternatively give them by name (see `from_settings`): ``arch``, ``filters``,
-            ``preset="loso"``, ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
+        config: settings; alternatively give them by name (see `from_settings`), as in ``preset="loso", epochs=20``.
         quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`).
-        fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`). Settings in
-            ``config.live`` that differ from the defaults are kept.
+        fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`), but for those
+            in ``config.live`` that differ from the defaults.
         journal: stores the progress of the training (see `unfinished`), so that an interrupted one resumes and gives
             the same bundle. The steps after the training are repeated.
-        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
-            Rows of the fine-tuning and of the training on everybody have ``what``. The others have ``accuracy``, that
-            of validation as ``scores`` counts it.
-        warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions;
-            by default, they are Python warnings (`PlushSenseWarning`).
+        progress: called with (epoch, maximum of epochs, row), first for the epochs before an interruption. Rows of the
+            fine-tuning and of the training on everybody have ``what``, and others the ``accuracy`` of validation.
+        warn: called with a sentence for everything unusual; by default, these are Python warnings.
     """
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")

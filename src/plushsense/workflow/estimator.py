@@ -272,6 +272,9 @@ def labels_from(bundle: Bundle) -> NDArray[Any]:
         raise BundleError(f"The bundle's class labels cannot be read ({cause}): train again.") from None
 
 
+if TYPE_CHECKING:
+    from plushsense.training.fit import FittedNetwork
+
 if TYPE_CHECKING or importlib.util.find_spec("sklearn") is None:
     # PlushClassifier must be importable without scikit-learn (`from plushsense import *`); constructing one then raises
     # MissingExtraError. Type checkers use these declarations as well.
@@ -419,30 +422,36 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             spec,
             weights=None if (trained == 1.0).all() else trained * scaling,
         )
-        parts = () if groups is None else (~held_back, held_back)
         self.classes_, self.history_ = classes, fitted.history
-        self.bundle_ = Bundle(
+        parts = () if groups is None else (~held_back, held_back)
+        origin = {
+            "dataset": "arrays given to PlushClassifier",
+            "estimator": {"settings": self._settings(), **_labels_table(classes)},
+            "windows": len(x),
+            "weighted": bool((trained != 1.0).any()),
+            **dict(zip_longest(_PEOPLE, [sorted(set(people[part].tolist())) for part in parts], fillvalue=[])),
+            "split": "none",
+            "preset": self.preset,
+            "training": spec.to_dict(),
+            "code_version": __version__,
+        }
+        self.bundle_ = self._bundle(arch, fitted, windows.take(np.flatnonzero(~held_back)), layout, origin)
+        return self
+
+    def _bundle(
+        self, arch: Arch, fitted: FittedNetwork, trained: WindowSet, layout: Layout, origin: dict[str, Any]
+    ) -> Bundle:
+        return Bundle(
             arch=arch,
             weights=fitted.weights,
             layout=layout,
             scaler=fitted.scaler,
-            gestures=gestures_of(classes),
-            windowing={"window_s": x.shape[2] / layout.rate_hz, "context": "unknown"},
+            gestures=gestures_of(self.classes_),
+            windowing={"window_s": trained.integers.shape[2] / layout.rate_hz, "context": "unknown"},
             decision=DecideSpec().to_dict(),
-            provenance={
-                "dataset": "arrays given to PlushClassifier",
-                "estimator": {"settings": self._settings(), **_labels_table(classes)},
-                "windows": len(x),
-                "weighted": bool((trained != 1.0).any()),
-                **dict(zip_longest(_PEOPLE, [sorted(set(people[part].tolist())) for part in parts], fillvalue=[])),
-                "split": "none",
-                "preset": self.preset,
-                "training": spec.to_dict(),
-                "code_version": __version__,
-            },
-            calibration=calibration(arch, fitted.weights, fitted.scaler, windows.integers[~held_back]),
+            provenance=origin,
+            calibration=calibration(arch, fitted.weights, fitted.scaler, trained.integers),
         )
-        return self
 
     def _weighted(
         self, x: NDArray[Any], labels: NDArray[Any], groups: ArrayLike | None, sample_weight: ArrayLike | None
