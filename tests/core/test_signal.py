@@ -52,7 +52,7 @@ def test_a_users_own_layout(tmp_path: Path) -> None:
         ('inputs = ["c"]', r"inputs names 'c'; known are a, b"),
         ("rate_hz = 0.0", "not valid TOML"),
         ('csv = { colums = ["a"] }', r"'colums'.*Did you mean 'columns'"),
-        ('derived = [{ name = "m", kind = "norm", of = ["a"] }]', "kind 'norm'"),
+        ('derived = [{ name = "m", kind = "norm", of = ["a"] }]', "is the norm of a: accepted"),
         ('derived = [{ name = "m", kind = "magnitude", of = ["a"] }]', "'a' feeds 'm'.*valid_min and valid_max"),
         ('csv = { columns = ["a", "b", "device_ms"], header = ["A", "B"] }', "csv.header has 2 texts for 3 columns"),
         ("inputs = [1]", "inputs.0. is 1: accepted is text"),

@@ -280,13 +280,14 @@ class Layout:
         if len(sensors) > MOST_CALIBRATED_SENSORS:
             yield f"self_calibration names {len(sensors)} sensors: accepted are up to {MOST_CALIBRATED_SENSORS}."
         for name in named:
+            at = self.index(name)
+            most = MOST_CALIBRATED if kinds[name] == ACCELERATION else MOST_CALIBRATED_OTHER
             of = next((vector for vector in self.vectors if name in vector), ())
             if not set(of) <= set(named) or (kinds[name] == ACCELERATION and not of):
                 known = "; ".join(map(", ".join, self.vectors)) or "none"
                 yield f"self_calibration names {name}: accepted are all three axes of a vector, here {known}."
             if kinds[name] in (BINARY, COUNT):
                 yield f"self_calibration names {name}: a channel of the kind '{kinds[name]}' has no scale to find."
-            at, most = self.index(name), MOST_CALIBRATED if kinds[name] == ACCELERATION else MOST_CALIBRATED_OTHER
             if max(abs(int(self.valid_min_int[at])), abs(int(self.valid_max_int[at]))) > most:
                 yield (
                     f"channel '{name}' is in self_calibration but is valid from {self.valid_min_int[at]} to "

@@ -38,7 +38,8 @@ class Symbol(NamedTuple):
 _N = "[1-9][0-9]{0,3}"
 _LAYER = f"{_N}(?:d{_N})?"
 _SYMBOL = re.compile(f"(?:v({_N})_)?({_LAYER}(?:_{_LAYER}){{0,{MAX_LAYERS - 1}}})")
-_SYMBOL_BEGIN = re.compile(f"(?:v{_N}_|v)?(?:{_LAYER}_){{0,{MAX_LAYERS - 1}}}(?:{_N}(?:d(?:{_N})?)?)?")
+_LAYERS_BEGIN = f"(?:{_LAYER}_){{0,{MAX_LAYERS - 1}}}(?:{_N}(?:d(?:{_N})?)?)?"
+_SYMBOL_BEGIN = re.compile(f"v(?:{_N}(?:_{_LAYERS_BEGIN})?)?|{_LAYERS_BEGIN}")
 _SYMBOL_FORM = (
     f"accepted are up to {MAX_LAYERS} kernel lengths joined by '_', each with d and its dilation where it has one, as "
     f"in 14d1_39d2_41d4, and before them v and the kernel length of a vector layer; numbers are 1 to {MAX_NUMBER}"

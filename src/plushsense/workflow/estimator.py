@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from hashlib import blake2b
-from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -47,7 +46,6 @@ _MOST_REPEATS = 10.0
 # this many samples. Accuracy on makeability, 5 folds by person, 30 epochs, one seed, of half and of the whole window:
 # 0.477 and 0.457 with 100 samples, 0.388 and 0.383 with 60.
 _SHORTEST_FIELD = 16
-_PEOPLE = ("subjects", "validation_subjects")
 # The settings that are used only in training.
 _TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
 
@@ -424,12 +422,14 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         )
         self.classes_, self.history_ = classes, fitted.history
         parts = () if groups is None else (~held_back, held_back)
-        origin = {
+        people_of = [sorted(set(people[part].tolist())) for part in parts]
+        origin: dict[str, Any] = {
             "dataset": "arrays given to PlushClassifier",
             "estimator": {"settings": self._settings(), **_labels_table(classes)},
             "windows": len(x),
             "weighted": bool((trained != 1.0).any()),
-            **dict(zip_longest(_PEOPLE, [sorted(set(people[part].tolist())) for part in parts], fillvalue=[])),
+            "subjects": people_of[0] if people_of else [],
+            "validation_subjects": people_of[1] if people_of else [],
             "split": "none",
             "preset": self.preset,
             "training": spec.to_dict(),

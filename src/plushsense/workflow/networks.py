@@ -119,5 +119,6 @@ class NetworkTrainer:
 
     def discard(self) -> None:
         """Delete the stored states of all these trainings."""
-        for job in self._stored if self.journal is not None else ():
-            self.journal.discard(job)
+        if self.journal is not None:
+            for job in self._stored:
+                self.journal.discard(job)
