@@ -160,7 +160,7 @@ def test_the_page_replaces_its_own_kind_only(cli: Cli, folder: Path, tmp_path: P
 
 
 def test_from_python(folder: Path) -> None:
-    from plushsense.workflow.datasets import decide
+    from plushsense.workflow.datasets import DecisionSpec, decide
 
     result = ps.check_dataset(folder)
     assert "CheckResult" in repr(result)
@@ -170,7 +170,7 @@ def test_from_python(folder: Path) -> None:
     assert len(figure.axes) == 2
     with pytest.raises(ConfigError, match="no limit 'durations'"):
         ps.check_dataset(ps.open_dataset(folder), limits={"durations": 1})
-    after, marked = decide(folder, exclude=["P2/Slow_*"], why="fell", who="Kim")
+    after, marked = decide(folder, DecisionSpec(exclude=["P2/Slow_*"], why="fell", who="Kim"))
     assert (marked, after.excluded, after.ok) == (2, 2, True)
 
 

@@ -188,15 +188,12 @@ def test_a_configuration_file_and_flags_over_it(cli: Cli, dataset: Dataset, tmp_
 
 BAD = [
     (["arch", "14d1_x9", "--filters", "8,12"], "    14d1_x9\n         ^"),
-    (["arch", "14d1_39d2", "--filters", "8"], "2 layers but only 1 filter"),
     (["arch", "14d1", "--filters", "8", "--paddng", "x"], "Did you mean '--padding'?"),
     (["arch", "14d1", "--filtres", "8"], "Unknown option --filtres"),
     (["arch", "14d1", "--filtres=8"], "Did you mean '--filters'?"),
     (["arch", "14d1"], "are required: --filters. See"),
-    (["train", "{ds}", "--seed", "-1"], "seed is -1"),
     (["evaluate", "{ds}", "--workers", "-1"], "workers is -1"),
     (["evaluate", "{ds}", "--out", "{half}"], "is a file; give a folder"),
-    (["evaluate", "{ds}", "--out", "{half}/deeper"], "is a file; give a folder"),
     (["simulate", "{half}/deeper", "--people", "1"], "half.plush"),
     (["import", "{recordings}", "{half}/deeper", "--layout", "accel-3"], "half.plush"),
     (["demo", "--out", "{half}"], "half.plush"),
@@ -206,24 +203,18 @@ BAD = [
     (["train", "{ds}", "--out", "{tmp}", "--force"], "is a folder: give a file"),
     (["stream-eval", "{ds}", "--model", "{bundle}", "--subjects", ",,"], "names nobody"),
     (["merge", "{ds}", "{ds}", "--out", "{tmp}/set.toml"], "give --merges or --groups"),
-    (["train", "{ds}", "--seed", "4294967296"], "accepted are whole numbers from 0 to 4294967295"),
     (["sweep", "{ds}", "--seeds", "1001", "--dry-run"], "accepted are 1 to 1000"),
     (["trian"], "Did you mean 'train'?"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "plush-15"], "has 5 columns, but a file of layout 'plush-15'"),
-    (["import", "{recordings}", "{tmp}/x", "--layout", "accel3"], "Did you mean 'accel-3'?"),
     (["import", "{tmp}", "{tmp}-x", "--layout", "accel-3"], "holds no recording"),
     (["evaluate", "{tmp}"], "is not a data set"),
     (["evaluate", "{ds}", "--split", "by-subjct:5"], "Did you mean 'by-subject:5'?"),
-    (["evaluate", "{ds}", "--split", "by-subject:50"], "there are 5"),
     (["evaluate", "{ds}", "--context", "strem"], "Did you mean 'stream'?"),
-    (["train", "{ds}", "--context", "anyware", "--out", "{tmp}/x.plush"], "Did you mean 'anywhere'?"),
     (["baselines", "{ds}", "--context", "anywhere", "--models", "quick"], "choose the context stream or loop"),
     (["train", "{ds}", "--classes", "Slwo,Fast"], "Did you mean 'Slow'?"),
-    (["train", "{ds}", "--preset", "lso"], "Did you mean 'loso'?"),
     (["live", "--device", "virtual://", "--model", "{half}"], "is damaged"),
     (["live", "--device", "virtual://", "--model", "{tmp}/none.plush"], "none.plush"),
     (["live", "--device", "serial:///dev/ttyUSB77", "--model", "{bundle}"], "there is no port"),
-    (["live", "--device", "seriel://x", "--model", "{bundle}"], "Did you mean 'serial'?"),
     (["report", "{tmp}/r.html", "--dataset", "{ds}", "--evaluation", "{tmp}/none"], "There is no evaluation"),
     (["toy", "--tcp", "0", "--gestures", "Tail tup 1"], "Did you mean 'Tail tap 1'?"),
 ]
@@ -295,38 +286,6 @@ def test_links_to_themselves_and_pipes_are_refused(cli: Cli, recordings: Path, t
     ):
         ran = cli(*words)
         assert ran.status == 2 and said in ran.err and ran.err.count("\n") == 1
-
-
-def test_a_layout_key_misspelt(cli: Cli, recordings: Path, tmp_path: Path) -> None:
-    layout = tmp_path / "own.toml"
-    layout.write_text('name = "own"\nrate_hertz = 100.0\nchannels = []\nwire = []\n')
-    ran = cli("import", recordings, tmp_path / "DS", "--layout", layout)
-    assert ran.status == 2
-    assert "Unknown key 'rate_hertz'" in ran.err
-    assert "Did you mean 'rate_hz'?" in ran.err
-
-
-def evaluations(dataset: Dataset) -> set[str]:
-    return {p.parent.name for p in (dataset.path / "evaluations").glob("*/evaluation.json")}
-
-
-@pytest.mark.exhaustive
-def test_evaluations_of_other_settings_stand_side_by_side(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
-    words = ("evaluate", dataset.path, "--filters", "2,2,2", "--epochs", "1", "--split", "by-subject:2", "--workers")
-    assert cli(*words, "1").status == 0
-    first = evaluations(dataset)
-    assert len(first) == 1
-    assert cli(*words, "1", "--device", "cpu").status == 0
-    assert evaluations(dataset) == first, "where it is computed changes no figure"
-    for setting in ("[training]\nlearning_rate = 0.01", "[training]\nturn_deg = 1", "[windows]\nstep_s = 0.4"):
-        config = tmp_path / "run.toml"
-        config.write_text(setting)
-        before = len(evaluations(dataset))
-        assert cli(*words, "1", "--config", config).status == 0
-        assert len(evaluations(dataset)) == before + 1, setting
-    assert cli(*words, "1", "--batch", "7", "--classes", "Slow,Fast").status == 0
-    assert cli(*words, "1", "--batch", "7", "--classes", "Slow,Rest").status == 0
-    assert len(evaluations(dataset)) == 6
 
 
 def test_a_name_depends_on_every_setting_and_on_the_data(dataset: Dataset) -> None:
@@ -428,24 +387,16 @@ def test_a_data_set_that_cannot_be_written_is_one_sentence(cli: Cli, dataset: Da
 WRONG = [
     ("model", "arch = 5", "text"),
     ("model", "filters = 5", "whole numbers"),
-    ("model", "filters = [4, true]", "whole number"),
-    ("model", "step_s = 'x'", "a number"),
     ("model", "step_s = 0", "above 0"),
     ("model", "pool_s = nan", "a number"),
     ("evaluation", "classes = 5", "text or a list of texts"),
-    ("evaluation", "seed = -1", "from 0 up"),
     ("evaluation", "seed = 'a'", "a whole number"),
-    ("evaluation", "seed = true", "a whole number"),
     ("evaluation", "train_context = 'lop'", "Did you mean 'loop'?"),
-    ("training", "device = 5", "text"),
-    ("training", "preset = 5", "text"),
     ("training", "epochs = 2.5", "a whole number"),
     ("windows", "context = ['x']", "text"),
     ("windows", "span_s = 3.0", "follows from the network"),
     ("windows", "windows_s = 3.0", "Did you mean 'window_s'?"),
-    ("live", "smoothing_s = 'x'", "a number"),
     ("anywhere", "idle_share = 1", "not including, 1"),
-    ("anywhere", "idel_share = 0.2", "Did you mean 'idle_share'?"),
 ]
 
 

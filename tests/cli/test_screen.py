@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import re
+import io
 from dataclasses import replace
 
 import pytest
+from rich.console import Console
+from rich.screen import Screen as RichScreen
 
-from plushsense.cli.terminal import KEYS, lines
+from plushsense.cli.terminal import KEYS, view
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.status import RecorderStatus
 from plushsense.recording.takes import SIGNAL
@@ -21,21 +23,18 @@ STATUS = RecorderStatus(
 )  # fmt: skip
 
 
-def plain(text: str) -> str:
-    return re.sub("\x1b\\[[0-9;]*m", "", text)
-
-
 def shown(width: int, height: int, status: RecorderStatus = STATUS) -> list[str]:
-    return [plain(line) for line in lines(status, "S01, session 1", ["No consent"], None, width, height)]
+    console = Console(file=io.StringIO(), width=width, height=height)
+    screen = view(status, "S01, session 1", ["No consent"], None)
+    rows = console.render_lines(RichScreen(screen), console.options)
+    return ["".join(part.text for part in row).rstrip() for row in rows]
 
 
-@pytest.mark.parametrize("width", [1, 2, 3, 20, 39, 79, 90])
-@pytest.mark.parametrize("height", [1, 2, 9, 19, 23, 60])
-@pytest.mark.parametrize("signal", list(SIGNAL))
-def test_any_size_is_survived(width: int, height: int, signal: str) -> None:
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (2, 9), (20, 2), (39, 60), (90, 23)])
+def test_any_size_is_survived(width: int, height: int) -> None:
     for state in KEYS:
-        found = shown(width, height, replace(STATUS, state=state, signal=signal))
-        assert 1 <= len(found) <= height
+        for signal in SIGNAL:
+            assert len(shown(width, height, replace(STATUS, state=state, signal=signal))) == height
 
 
 def test_narrow_lines_are_broken_not_cut() -> None:

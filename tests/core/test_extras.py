@@ -1,12 +1,6 @@
-import json
-
 import pytest
 
 from plushsense.core.errors import MissingExtraError, need
-
-
-def test_a_present_module_is_returned() -> None:
-    assert need("json", "train") is json
 
 
 def test_a_missing_package_names_the_install_command() -> None:

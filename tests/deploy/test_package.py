@@ -17,7 +17,7 @@ from plushsense.deploy.code import read_facts
 from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE
 from plushsense.deploy.proof.vectors import Export
 from plushsense.runtime.image import IntegerModel, image_check
-from plushsense.workflow.export import export
+from plushsense.workflow.export import PackageNames, export
 from support.exports import bundle_of
 from support.virtual_boards import WARNINGS, run
 
@@ -135,7 +135,7 @@ def test_cmake_builds_it_as_a_folder_as_a_package_and_as_a_zephyr_module(
     needs: Callable[..., None], tmp_path: Path
 ) -> None:
     needs("cmake", "gcc")
-    out = export(bundle_of(window=60), tmp_path / "out", name="owl", model_version="1.2.3-beta.1").folder
+    out = export(bundle_of(window=60), tmp_path / "out", package=PackageNames("owl", "1.2.3-beta.1")).folder
     module = dict(
         row.strip().split(": ") for row in (out / "zephyr/module.yml").read_text().splitlines() if ": " in row
     )
@@ -165,7 +165,7 @@ def test_the_model_s_own_version_and_page_stand_in_every_manifest_and_in_c(tmp_p
     hashed = "0123456789abcdef" * 4
     bundle = replace(bundle_of(window=60), provenance={"dataset_hash": hashed})
     page = "https://example.org/toy"
-    out = export(bundle, tmp_path / "out", model_version="2.10.0-beta.1", url=page, name="owl").folder
+    out = export(bundle, tmp_path / "out", package=PackageNames("owl", "2.10.0-beta.1", page)).folder
     library = out / "arduino" / "owl_plush"
     assert broken_rules(library) == [] and Export(out).changed == ()
     properties = (library / "library.properties").read_text(encoding="utf-8")

@@ -8,14 +8,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from plushsense.core.errors import ConfigError, TrainingError
-from plushsense.evaluation.crossval import evaluate
+from plushsense.evaluation.crossval import CrossvalSpec, evaluate
 from plushsense.jobs.journal import Journal
+from plushsense.jobs.pool import JobsSpec
 from plushsense.jobs.progress import JobProgress
 from plushsense.scoring.splits import parse_split
 
@@ -36,7 +36,9 @@ def trainings(folder: Path) -> dict[str, int]:
 
 def test_every_figure_of_a_subject_wise_evaluation(tmp_path: Path) -> None:
     windows, loops = study(), study(context="loop")
-    found = evaluate(loops, windows, parse_split("leave-one-subject-out"), Oracle(str(tmp_path), ("P01",)), seed=3)
+    found = evaluate(
+        loops, windows, parse_split("leave-one-subject-out"), Oracle(str(tmp_path), ("P01",)), CrossvalSpec(3)
+    )
     table = found.to_json()
     assert table.keys() == KEYS
     json.dumps(table, allow_nan=False)
@@ -94,9 +96,8 @@ def test_a_holdout_scores_what_it_tested_only() -> None:
 def test_progress_and_the_same_result_from_several_processes(tmp_path: Path, workers: int) -> None:
     said: list[JobProgress] = []
     windows = study()
-    found = evaluate(
-        windows, windows, parse_split("by-subject:3"), Oracle(str(tmp_path)), workers=workers, progress=said.append
-    )
+    split, spec = parse_split("by-subject:3"), CrossvalSpec(jobs=JobsSpec(workers))
+    found = evaluate(windows, windows, split, Oracle(str(tmp_path)), spec, progress=said.append)
     assert [s.done for s in said if s.epoch == 0] == [1, 2, 3]
     assert sorted((s.name, s.epoch) for s in said if s.epoch) == [
         (f"fold {f}", e) for f in (1, 2, 3) for e in (1, 2, 3)
@@ -108,19 +109,21 @@ def test_progress_and_the_same_result_from_several_processes(tmp_path: Path, wor
 
 def test_finished_folds_are_not_trained_again_and_changed_ones_are(tmp_path: Path) -> None:
     windows, journal, oracle = study(), Journal(tmp_path / "journal"), Oracle(str(tmp_path))
-    ask: dict[str, Any] = {"journal": journal, "key": {"arch": "a", "seed": 1}}
-    first = evaluate(windows, windows, parse_split("by-subject:3"), oracle, **ask)
+    ask = CrossvalSpec(jobs=JobsSpec(journal=journal), key={"arch": "a", "seed": 1})
+    first = evaluate(windows, windows, parse_split("by-subject:3"), oracle, ask)
     said: list[JobProgress] = []
-    again = evaluate(windows, windows, parse_split("by-subject:3"), oracle, progress=said.append, **ask)
+    again = evaluate(windows, windows, parse_split("by-subject:3"), oracle, ask, progress=said.append)
     assert sum(trainings(tmp_path).values()) == 3 and said[-1].resumed == 3
     assert again.to_json() == first.to_json()
     next(journal.folder.iterdir()).write_bytes(b"damaged")
-    evaluate(windows, windows, parse_split("by-subject:3"), oracle, **ask)
+    evaluate(windows, windows, parse_split("by-subject:3"), oracle, ask)
     assert sum(trainings(tmp_path).values()) == 4
     changed = replace(windows, integers=windows.integers + 1)
-    for other, key, seed in ((windows, {"arch": "b"}, 0), (changed, ask["key"], 0), (windows, ask["key"], 5)):
+    for other, spec in (
+        (windows, replace(ask, key={"arch": "b"})), (changed, ask), (windows, replace(ask, seed=5))
+    ):  # fmt: skip
         before = sum(trainings(tmp_path).values())
-        evaluate(other, other, parse_split("by-subject:3"), oracle, journal=journal, key=key, seed=seed)
+        evaluate(other, other, parse_split("by-subject:3"), oracle, spec)
         assert sum(trainings(tmp_path).values()) > before
 
 
@@ -148,21 +151,28 @@ def test_what_goes_wrong_is_said() -> None:
     with pytest.raises(ConfigError, match=r"shape \(1, 3\).*\(20, 3\)"):
         evaluate(windows, windows, parse_split("by-subject:3"), misshapen)
     with pytest.raises(ConfigError, match="journal needs a key"):
-        evaluate(windows, windows, parse_split("by-subject:3"), refuses, journal=Journal("nowhere"))
+        evaluate(
+            windows,
+            windows,
+            parse_split("by-subject:3"),
+            refuses,
+            CrossvalSpec(jobs=JobsSpec(journal=Journal("nowhere"))),
+        )
 
 
 SCRIPT = """
 import sys
 sys.path.insert(0, {here!r})
 from support.fakes import Oracle, study
-from plushsense.evaluation.crossval import evaluate
+from plushsense.evaluation.crossval import CrossvalSpec, evaluate
 from plushsense.scoring.splits import parse_split
 from plushsense.jobs.journal import Journal
+from plushsense.jobs.pool import JobsSpec
 
 if __name__ == "__main__":
     windows = study()
-    evaluate(windows, windows, parse_split("leave-one-subject-out"), Oracle({folder!r}, pause=0.05), workers={workers},
-             journal=Journal({folder!r} + "/journal"), key={{"arch": "a"}})
+    spec = CrossvalSpec(jobs=JobsSpec({workers}, journal=Journal({folder!r} + "/journal")), key={{"arch": "a"}})
+    evaluate(windows, windows, parse_split("leave-one-subject-out"), Oracle({folder!r}, pause=0.05), spec)
 """
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.evaluation.crossval import FoldOutput, evaluate
+from plushsense.evaluation.crossval import CrossvalSpec, FoldOutput, evaluate
 from plushsense.jobs.journal import Journal
+from plushsense.jobs.pool import JobsSpec
 from plushsense.scoring.splits import parse_split
 from support.fakes import Deploying, Oracle, study
 
@@ -49,10 +50,8 @@ def test_folds_where_people_are_not_kept_apart(tmp_path: Path) -> None:
 
 def test_it_comes_back_from_the_journal_and_is_not_made_up_without(tmp_path: Path) -> None:
     journal, work = Journal(tmp_path / "folds"), Deploying(str(tmp_path), ("P02",))
-    first, second = (
-        evaluate(study(), study(), parse_split("by-subject:3"), work, journal=journal, key={"int8": 1}).to_json()
-        for _ in range(2)
-    )
+    spec = CrossvalSpec(jobs=JobsSpec(journal=journal), key={"int8": 1})
+    first, second = (evaluate(study(), study(), parse_split("by-subject:3"), work, spec).to_json() for _ in range(2))
     assert first == second and "int8" in first
     trained = sum(len(path.read_text()) for path in tmp_path.glob("trained-*"))
     assert trained == 2 * 3, "a second run trains nothing"

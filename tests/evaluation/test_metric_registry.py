@@ -35,8 +35,8 @@ head = {"split": "by-subject:2", "context": "stream", "train_context": "stream",
 text = "\\n".join(lines({**head, "simulated": False, **found}))
 assert "kappa           0.250" in text and "kappa lost          0.000" in text
 assert report.metric_table({**head, **found}).rows[-2]["name"] == "Kappa"
-assert report.subject_rows([found])[0]["cells"][0]["kappa"] == "0.25"
-assert len(report.comparison_rows([{**head, **found, "title": "t"}])[0]["scores"]) == 3
+assert report._subject_rows([found])[0]["cells"][0]["kappa"] == "0.25"
+assert len(report._comparison_rows([{**head, **found, "title": "t"}])[0]["scores"]) == 3
 assert {"kappa", "kappa_sd"} <= trials.TRIAL_COLUMNS.keys() and "kappa" in folder._RUN_COLUMNS
 assert "Kappa" in [c.head for c in trials.listed_columns(terminal=True)]
 assert "Kappa" in [c.head for c in sweep._metric_columns(without="accuracy")]

@@ -103,40 +103,27 @@ def test_symbols_are_spelt_as_in_the_paper(symbol: str) -> None:
 
 
 BAD = [
-    ("", 1, "nothing is given"),
-    ("_14", 1, "nothing stands here"),
-    ("14__39", 4, "nothing stands here"),
-    ("14_", 4, "nothing stands here"),
-    ("14d", 4, "dilation of layer 1 is expected"),
-    ("14d_3", 4, "dilation of layer 1 is expected"),
-    ("0", 1, "kernel length of layer 1 is 0"),
-    ("14_00d2", 4, "kernel length of layer 2 is 0"),
-    ("14d1_39d0", 9, "dilation of layer 2 is 0"),
-    ("14x2", 3, "unknown token 'x'"),
-    ("14d2d3", 5, "unknown token 'd'"),
-    ("d2", 1, "unknown token 'd'"),
-    ("14 d2", 3, "unknown token ' '"),
-    ("14D2", 3, "unknown token 'D'"),
-    ("-14", 1, "unknown token '-'"),
-    ("1.5", 2, "unknown token '.'"),
-    ("٣", 1, "unknown token '٣'"),
-    ("14\n", 3, "unknown token"),
-    ("1_2_3_4_5", 9, "more than 4 layers"),
-    ("14d99999", 4, "too large"),
-    ("9" * 5000, 1, "too large"),
-    ("14_39_41_17", 10, "4 layers but only 3 filter counts (8,12,16)"),
-]
+    ("", 1), ("_14", 1), ("14__39", 4), ("14_", 4), ("14d", 4), ("14d_3", 4), ("0", 1), ("14_00d2", 4),
+    ("14d1_39d0", 9), ("14x2", 3), ("14d2d3", 5), ("d2", 1), ("14 d2", 3), ("14D2", 3), ("-14", 1), ("1.5", 2),
+    ("٣", 1), ("14\n", 3), ("1_2_3_4_5", 8), ("14d99999", 8), ("9" * 5000, 5), ("v14", 4), ("v_3", 2),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("spec", "place", "why"), BAD)
-def test_errors_show_the_symbol_and_a_caret_at_the_place(spec: str, place: int, why: str) -> None:
+@pytest.mark.parametrize(("spec", "place"), BAD)
+def test_errors_show_the_symbol_and_a_caret_at_the_place(spec: str, place: int) -> None:
     with pytest.raises(ArchError) as caught:
         Arch.parse(spec, (8, 12, 16))
     sentence, (shown, caret) = str(caught.value), caught.value.__notes__[0].split("\n")
-    assert why in sentence
-    assert f"place {place}:" in sentence
+    assert f"place {place}: accepted are up to 4 kernel lengths" in sentence
     assert shown == "    " + spec.replace("\n", "?")
     assert caret == " " * (4 + place - 1) + "^"
+
+
+def test_too_few_filters_and_a_kernel_that_is_too_long() -> None:
+    with pytest.raises(ArchError, match=r"place 10: 4 layers but only 3 filter counts \(8,12,16\)"):
+        Arch.parse("14_39_41_17", (8, 12, 16))
+    with pytest.raises(ArchError, match="kernel of layer 1 is 5000: accepted are whole numbers from 1 to 4096"):
+        Arch.parse("5000", (8,))
 
 
 @pytest.mark.parametrize(

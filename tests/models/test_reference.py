@@ -192,15 +192,6 @@ def test_weights_of_another_network_are_refused(change: dict[str, Any], why: str
         Network(arch, weights)
 
 
-def test_random_weights_are_alive_and_repeatable() -> None:
-    arch = Arch.parse("14d1_19d2_19d4", (8, 12, 16))
-    one, again, other = random_weights(arch, 1), random_weights(arch, 1), random_weights(arch, 2)
-    assert all((one[k] == again[k]).all() and one[k].dtype == np.float32 for k in one)
-    assert (one["conv0.weight"] != other["conv0.weight"]).any()
-    logits = Network(arch, one).forward(np.random.default_rng(0).normal(size=(8, 11, 246)))
-    assert 0.3 < logits.std() < 10 and np.abs(logits - logits[0]).max() > 0.05
-
-
 def test_features_are_what_the_dense_layer_reads() -> None:
     arch = Arch.parse("14d1_19d2_19d4", (8, 12, 16))
     network = Network(arch, random_weights(arch, 1))

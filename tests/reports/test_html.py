@@ -135,27 +135,6 @@ def test_a_place_that_cannot_be_written_is_one_sentence(tmp_path, study):
         write_evaluation_report(tmp_path / "file" / "report.html", **study)
 
 
-def test_an_older_report_is_replaced_whole(tmp_path, study):
-    target = tmp_path / "report.html"
-    write_evaluation_report(target, **study)
-    target.write_text(target.read_text(encoding="utf-8") + "old" * 1_000_000, encoding="utf-8")
-    write_evaluation_report(target, **{**study, "evaluations": []})
-    assert target.read_text(encoding="utf-8").rstrip().endswith("</html>")
-
-
-@pytest.mark.parametrize("name", ["thesis.html", "thesis.docx", "folder.html", "noending"])
-def test_nothing_else_is_ever_replaced(name, tmp_path, study):
-    target = tmp_path / name
-    if name == "folder.html":
-        target.mkdir()
-    else:
-        target.write_text("<!DOCTYPE html><title>my thesis</title>")
-    with pytest.raises(ConfigError, match="give another file|give a file|change the name"):
-        write_evaluation_report(target, **study)
-    assert target.is_dir() or "my thesis" in target.read_text()
-    assert len(list(tmp_path.iterdir())) == 1
-
-
 def section(page: str, key: str) -> str:
     """The part of a page about one evaluation."""
     return page.split(f'<h2 id="{key}">')[1].split('<h2 id="')[0]

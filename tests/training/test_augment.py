@@ -13,7 +13,7 @@ from plushsense.training.augment import (
     parse_augmentation,
     rotations,
 )
-from plushsense.training.spec import PRESETS, TrainSpec, preset
+from plushsense.training.spec import PRESETS, preset
 from plushsense.windows.features import Scaler
 
 
@@ -111,27 +111,7 @@ def test_a_new_augmentation_is_a_function_and_a_line(monkeypatch: pytest.MonkeyP
     assert 0.05 < float(out.std()) < 0.2 and float(x.abs().max()) == 0.0
 
 
-def test_an_angle_in_an_earlier_file_means_the_same() -> None:
-    assert preset("loso", turn_deg=20.0) == TrainSpec(augment=("random-rotation:20.0",))
-    assert preset("people", turn_deg=0.0).augment == ()
-    assert preset("people").to_dict()["turn_deg"] == 45.0 and "augment" not in preset("people").to_dict()
-    assert list(TrainSpec().to_dict())[6:8] == ["turn_deg", "seed"]
-
-
 @pytest.mark.parametrize("text", ["random-rotation", "random-rotation:x", "random-rotation:181", "random-rotation:-1"])
 def test_a_strength_that_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r"0 \(off\) to 180 degrees"):
         parse_augmentation(text)
-
-
-def test_a_strength_without_a_unit_is_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(AUGMENTATIONS, "dropout", Augmentation(lambda strength, channels: None, 0.9))
-    with pytest.raises(ConfigError, match=r"write dropout:NUMBER with 0 \(off\) to 0\.9\.$"):
-        parse_augmentation("dropout:1")
-
-
-def test_an_unknown_augmentation_is_refused() -> None:
-    with pytest.raises(ConfigError, match="Did you mean 'random-rotation'"):
-        TrainSpec(augment=("random-rotaton:4",))
-    with pytest.raises(ConfigError, match="Both augment and turn_deg"):
-        preset("people", augment=["random-rotation:4"], turn_deg=3.0)

@@ -18,7 +18,7 @@ if not torch.cuda.is_available():
     pytest.skip("there is no graphics card with CUDA", allow_module_level=True)
 
 from plushsense.training import engine
-from plushsense.training.fit import FittedNetwork, fit, predict
+from plushsense.training.fit import FittedNetwork, StoreSpec, fit, predict
 
 Make = Callable[..., WindowSet]
 SPEC = TrainSpec(epochs=12, batch=16, patience=None, device="cuda")
@@ -72,4 +72,4 @@ def test_a_training_goes_on_as_if_it_had_never_stopped(made: Make) -> None:
     train = made(70)
     whole, short = fit(train, None, arch(), SPEC), fit(train, None, arch(), replace(SPEC, epochs=5))
     assert short.state is not None
-    assert same(whole, fit(train, None, arch(), SPEC, start=short.state))
+    assert same(whole, fit(train, None, arch(), SPEC, store=StoreSpec(short.state)))

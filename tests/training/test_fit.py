@@ -19,7 +19,7 @@ from plushsense.windows.cut import WindowSet
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
 from plushsense.training.engine import Adam, FitState
-from plushsense.training.fit import fit, predict, with_hard_negatives
+from plushsense.training.fit import StoreSpec, fit, predict
 
 pytestmark = pytest.mark.apart("trainings")
 
@@ -216,7 +216,7 @@ def test_the_number_of_threads_is_put_back(made: Make) -> None:
 
 def test_a_long_training_passes_through_the_end_of_a_short_one(made: Make) -> None:
     spec = replace(SPEC, epochs=4, halve_every=None, patience=None)
-    long = fit(made(40), None, arch(), spec, keep=(2, 4))
+    long = fit(made(40), None, arch(), spec, store=StoreSpec(keep=(2, 4)))
     short = fit(made(40), None, arch(), replace(spec, epochs=2))
     assert sorted(long.kept) == [2, 4]
     for name, values in short.weights.items():
@@ -228,25 +228,23 @@ def test_a_long_training_passes_through_the_end_of_a_short_one(made: Make) -> No
 def test_a_training_goes_on_as_if_it_had_never_stopped(made: Make, tmp_path: Path, padding: str) -> None:
     spec = replace(SPEC, epochs=7, halve_every=2, patience=None, augment=("random-rotation:20",))
     train = replace(made(50), vectors=())
-    whole = fit(train, made(20, seed=4), arch(padding=padding), spec, keep=(3, 5))
+    whole = fit(train, made(20, seed=4), arch(padding=padding), spec, store=StoreSpec(keep=(3, 5)))
     saved: list[FitState] = []
-    short = fit(
-        train, made(20, seed=4), arch(padding=padding), replace(spec, epochs=3), keep=(3,), save=saved.append,
-        save_every_s=0.0,
-    )  # fmt: skip
+    store = StoreSpec(keep=(3,), save=saved.append, save_every_s=0.0)
+    short = fit(train, made(20, seed=4), arch(padding=padding), replace(spec, epochs=3), store=store)
     assert [state.epoch for state in saved] == [1, 2, 3]
     journal = Journal(tmp_path)
     journal.save("short", short.state.to_arrays())  # type: ignore[union-attr]
     state = FitState.from_arrays(journal.load("short"))
     assert state.epoch == 3
-    went_on = fit(train, made(20, seed=4), arch(padding=padding), spec, keep=(3, 5), start=state)
+    went_on = fit(train, made(20, seed=4), arch(padding=padding), spec, store=StoreSpec(state, (3, 5)))
     assert went_on.history == whole.history
     assert sorted(went_on.kept) == sorted(whole.kept) == [3, 5]
     for name, values in whole.weights.items():
         assert np.array_equal(values, went_on.weights[name])
         assert all(np.array_equal(whole.kept[epoch][name], went_on.kept[epoch][name]) for epoch in (3, 5))
     with pytest.raises(TrainingError, match="leave patience out"):
-        fit(train, made(20, seed=4), arch(padding=padding), replace(spec, patience=3), start=state)
+        fit(train, made(20, seed=4), arch(padding=padding), replace(spec, patience=3), store=StoreSpec(state))
 
 
 @pytest.mark.parametrize("stop_on", ["loss", "accuracy"])
@@ -254,39 +252,12 @@ def test_a_training_that_stops_early_goes_on_as_well(made: Make, tmp_path: Path,
     spec = replace(SPEC, epochs=40, learning_rate=0.05, patience=3, stop_on=stop_on)
     train, validation, journal = made(30), made(20, seed=4), Journal(tmp_path)
     states: list[FitState] = []
-    whole = fit(train, validation, arch(), spec, save=states.append, save_every_s=0.0)
+    whole = fit(train, validation, arch(), spec, store=StoreSpec(save=states.append, save_every_s=0.0))
     assert len(whole.history) == whole.best_epoch + 3 < 40
     # Stopped after any epoch, also between the best one and the end.
     for state in states:
         journal.save("stopped", state.to_arrays())
-        went_on = fit(train, validation, arch(), spec, start=FitState.from_arrays(journal.load("stopped")))
+        store = StoreSpec(FitState.from_arrays(journal.load("stopped")))
+        went_on = fit(train, validation, arch(), spec, store=store)
         assert (went_on.history, went_on.best_epoch) == (whole.history, whole.best_epoch)
         assert all(np.array_equal(values, went_on.weights[name]) for name, values in whole.weights.items())
-
-
-def test_hard_negatives_are_the_idle_windows_that_look_like_a_gesture(made: Make) -> None:
-    idle = 2
-    train, easy = made(60), made(60, seed=4)
-    easy = easy.take(np.flatnonzero(easy.y == idle))
-    # Gestures that nobody marked: windows of class 0 that are labelled as idle.
-    hard = made(60, seed=5)
-    hard = hard.take(np.flatnonzero(hard.y == 0))
-    hard = replace(hard, y=np.full_like(hard.y, idle))
-    candidates = easy.joined(hard)
-    assert len(candidates) == len(easy) + len(hard) and candidates.integers.shape[1:] == easy.integers.shape[1:]
-    names = [candidates.recording_ids[r] for r in candidates.recording]
-    assert names == [w.recording_ids[r] for w in (easy, hard) for r in w.recording]
-    spec = replace(SPEC, epochs=25)
-    more = with_hard_negatives(train, candidates, idle, (0, 1), arch(), spec, share=0.1)
-    added = more.take(np.arange(len(train), len(more)))
-    assert (
-        0 < len(added) <= 6 and np.array_equal(more.integers[: len(train)], train.integers) and set(added.y) == {idle}
-    )
-    assert all(any(np.array_equal(x, other) for other in hard.integers) for x in added.integers)
-    # What is no reaction may be reported.
-    assert with_hard_negatives(train, hard, idle, (1,), arch(), spec, share=0.1).integers.shape == train.integers.shape
-    # Gestures among the candidates are ignored, and with no share nothing is trained.
-    assert (
-        with_hard_negatives(train, made(30, seed=6).take(np.arange(0)), idle, (0, 1), arch(), spec, share=0.1) is train
-    )
-    assert with_hard_negatives(train, candidates, idle, (0, 1), arch(), spec, share=0.0) is train

@@ -255,7 +255,7 @@ def test_cut_windows_says_who_cuts_these(dataset: Dataset) -> None:
 
 def test_settings_at_the_ends_of_their_range() -> None:
     ends = {"every_s": (0.01, 60.0), "onset_s": (0.0, 60.0), "after_s": (0.0, 1.0), "settle_s": (0.2, 60.0)}
-    shares = {"idle_share": (0.0, 0.99), "busy_share": (0.0, 1.0), "hard_share": (0.0, 1.0)}
+    shares = {"idle_share": (0.0, 0.99), "busy_share": (0.0, 1.0)}
     for name, (low, high) in (ends | shares).items():
         for value in (low, high):
             assert getattr(AnywhereSpec(**{name: value}), name) == value

@@ -171,23 +171,11 @@ def test_the_ranges_of_a_network_trained_anywhere_come_from_its_own_windows(data
     assert np.array_equal(training_windows(bundle, dataset), mine)
 
 
-def test_a_long_receptive_field_gets_the_past_it_needs(dataset: Dataset) -> None:
-    bundle = ps.train(dataset, arch="14d1_39d2_41d4", filters=(2, 2, 2), epochs=1).bundle
-    assert bundle.arch.span == 499
-
-
 def test_unknown_settings_and_too_few_classes_are_refused(dataset: Dataset) -> None:
     with pytest.raises(ConfigError, match="Did you mean 'epochs'"):
         ps.train(dataset, epoch=2)
     with pytest.raises(DatasetError, match="At least 2 gestures are needed, not 1"):
         ps.train(dataset, classes="Slow")
-
-
-def test_notebook_faces(dataset: Dataset, bundle: Path) -> None:
-    assert "30 recordings, 5 people" in repr(dataset)
-    assert "<table>" in dataset._repr_html_()
-    assert "30 recordings" in repr(ps.cut_windows(dataset))
-    assert "v14_17d2_19d4" in repr(ps.load(bundle))
 
 
 @pytest.mark.parametrize("scaling", ["z-score", "none"])
@@ -233,13 +221,12 @@ def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:
 )
 def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path: Path) -> None:
     from plushsense.workflow.config import resolve
-    from plushsense.workflow.preparation import prepare, split_validation
+    from plushsense.workflow.preparation import prepare_training
 
     dataset = long_recordings(tmp_path, people, 4)
-    windows = ps.cut_windows(dataset)
-    assert len(windows) == 6 * len(dataset.recordings), "several windows a recording"
-    division = split_validation(windows, prepare(dataset, resolve(None)))
-    trained, scored = (set(windows.recording[i].tolist()) for i in (division.train, division.fold.test))
+    made = prepare_training(dataset, resolve(None))
+    assert len(made.windows) == 6 * len(dataset.recordings), "several windows a recording"
+    trained, scored = (set(made.windows.recording[i].tolist()) for i in (made.train, made.fold.test))
     assert trained
     assert scored
     assert not trained & scored

@@ -52,13 +52,6 @@ def test_data_of_other_content_is_used_with_a_word_and_of_other_people_refused(d
         calibrated_on(replace(bundle, provenance=origin | {"split": "windows:holdout"}), dataset)
 
 
-def test_the_classifier_of_arrays_has_a_calibration(scikit_learn: None) -> None:
-    rng = np.random.default_rng(0)
-    x = np.cumsum(rng.normal(size=(24, 3, 160)), axis=2)
-    model = ps.PlushClassifier(arch="5d1_4d2", filters=(4, 4), epochs=1, random_state=0).fit(x, np.arange(24) % 2)
-    assert integer_model(model.to_bundle()).to_bytes()
-
-
 def test_fine_tuning_for_8_bits_keeps_the_ranges_it_was_made_for(dataset: Dataset, tmp_path: Path) -> None:
     said: list[str] = []
     plain = ps.train(dataset, epochs=4, filters=(4, 4, 4), warn=said.append)

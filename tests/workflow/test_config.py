@@ -32,4 +32,4 @@ def test_augmentations_that_are_given_stay_with_any_network(dataset: Dataset, tm
     path.write_text('[training]\naugment = ["random-rotation:45"]\n')
     run = prepare(dataset, resolve(path))
     assert run.training.augment == ("random-rotation:45",)
-    assert "augment_given" not in run.settings()
+    assert "augment_given" not in run.to_json()

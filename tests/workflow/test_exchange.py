@@ -11,7 +11,7 @@ import pytest
 import plushsense as ps
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.store import Dataset
-from plushsense.workflow.exchange import to_hugging_face, to_pandas, to_panel, to_torch, to_xdf
+from plushsense.workflow.exchange import to_hugging_face, to_panel, to_torch, to_xdf
 from support.requirements import missing
 
 pytestmark = pytest.mark.apart("estimator")
@@ -33,7 +33,7 @@ def contents(dataset: Dataset, located: bool = True) -> list[tuple[object, ...]]
     )
 
 
-def test_windows_for_pytorch_aeon_and_pandas(dataset: Dataset, tables: None) -> None:
+def test_windows_for_pytorch_and_aeon(dataset: Dataset) -> None:
     windows = ps.cut_windows(dataset)
     x, y = to_panel(windows)
     assert (x.shape, x.dtype) == (windows.x.shape, np.float64)
@@ -42,11 +42,6 @@ def test_windows_for_pytorch_aeon_and_pandas(dataset: Dataset, tables: None) -> 
     assert len(torch) == len(windows)
     assert np.array_equal(torch.tensors[0].numpy(), x.astype(np.float32))
     assert np.array_equal(torch.tensors[1].numpy(), windows.y)
-    samples, about = to_pandas(windows)
-    assert samples.index.names == ["window", "sample"]
-    assert np.array_equal(samples.loc[3, "y"], x[3, windows.inputs.index("y")])
-    assert about.loc[3].tolist() == [y[3], "none", windows.subject[3], *about.loc[3, ["recording", "context"]]]
-    assert about.loc[3, "recording"] in {r.id for r in dataset.used if r.gesture == y[3]}
 
 
 def test_a_folder_for_hugging_face_is_imported_again(dataset: Dataset, tmp_path: Path, tables: None) -> None:

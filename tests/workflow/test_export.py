@@ -95,11 +95,6 @@ def test_what_cannot_be_deployed(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_is_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(tmp_path), str(tmp_path / "out")]) == 2
-    assert "is a folder: give a *.plush file" in capsys.readouterr().err
-
-
 def test_an_export_says_of_how_many_people(tmp_path: Path, bundle: Bundle) -> None:
     origin = {"subjects": ["Anna", "Bo"], "validation_subjects": ["Cleo"], "scores": {"accuracy": 0.5, "macro_f1": 0.4}}
     done = ps.export(replace(bundle, provenance=origin), tmp_path / "out")

@@ -29,7 +29,7 @@ _STRETCHES = 40
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.quality.checking import known_checks
-    from plushsense.workflow.datasets import decide
+    from plushsense.workflow.datasets import DecisionSpec, decide
 
     if _decides_labels(args):
         return _label(args)
@@ -39,14 +39,10 @@ def run(args: argparse.Namespace) -> int:
         from plushsense.reports.page import check_page_path
 
         check_page_path(args.report)
-    result, marked = decide(
-        args.dataset,
-        **options(args, "accept", "unaccept", "exclude", "include", "why", "who"),
-        only=only,
-        limits=_limits(args.limit),
-        progress=ProgressReporter("checking"),
-    )
-    if args.accept or args.unaccept or args.exclude or args.include:
+    spec = DecisionSpec(**options(args, "accept", "unaccept", "exclude", "include", "why", "who"))
+    limits, progress = _limits(args.limit), ProgressReporter("checking")
+    result, marked = decide(args.dataset, spec, only=only, limits=limits, progress=progress)
+    if spec:
         say(f"{marked} mark{'s' if marked != 1 else ''} added" + ("" if marked else ": all were there already") + ".")
     page = result.report(args.report, ProgressReporter("drawing")) if args.report else None
     emit(

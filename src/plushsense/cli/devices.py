@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -146,15 +147,11 @@ def _play_to_folder(args: argparse.Namespace, spec: ToySpec) -> int:
 def run_simulate(args: argparse.Namespace) -> int:
     from plushsense.workflow.api import simulate
 
-    summary = simulate(
-        args.out,
-        **options(args, "people", "repetitions", "seed", "dataset"),
-        progress=report_stages(),
-    )
+    done = simulate(args.out, **options(args, "people", "repetitions", "seed", "dataset"), progress=report_stages())
     emit(
         args,
-        summary,
-        f"{args.dataset or args.out}: {plural(summary['recordings'], 'recording')} of "
+        asdict(done) | ({"dataset": args.dataset} if args.dataset else {}),
+        f"{args.dataset or args.out}: {plural(done.recordings, 'recording')} of "
         f"{plural(args.people, 'virtual person')}. "
         "A simulation: scores on it say nothing about a real toy.",
     )

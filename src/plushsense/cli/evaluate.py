@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
-    from plushsense.workflow.api import evaluate_run
+    from plushsense.workflow.api import FoldsSpec, evaluate_run
     from plushsense.workflow.preparation import prepare
     from plushsense.workflow.reporting import PAGE, write_report
 
@@ -28,20 +28,13 @@ def run(args: argparse.Namespace) -> int:
 
         saved = save_windows(args.dataset, args.save_windows, config, overwrite=args.force, warn=warn)
         sizes = join_names(f"{n} {name}" for name, n in saved.windows.items())
-        emit(args, saved.to_dict(), [f"{saved.path}: windows: {sizes}; {saved.bytes:,} bytes"])
+        emit(args, saved.to_json(), [f"{saved.path}: windows: {sizes}; {saved.bytes:,} bytes"])
         return 0
     dataset = open_dataset(args.dataset)
     made = prepare(dataset, config, warn)
     out = Path(args.out) if args.out else dataset.path / "evaluations" / made.name
-    result = evaluate_run(
-        made,
-        out=out,
-        overwrite=args.force,
-        cluster=args.cluster,
-        int8=args.int8,
-        progress=report_jobs("evaluating"),
-        warn=warn,
-    )
+    spec = FoldsSpec(out, args.force, args.cluster, args.int8)
+    result = evaluate_run(made, spec, progress=report_jobs("evaluating"), warn=warn)
     report = write_report(out / PAGE, dataset, [out])
     content = {**result.to_json(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
     say(f"written: {out}")

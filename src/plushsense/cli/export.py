@@ -37,13 +37,13 @@ def _conversion(entry: ConversionFacts) -> str:
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.workflow.export import export
+    from plushsense.workflow.export import PackageNames, export
 
     if args.patch_for is not None:
         return _patch(args)
     also = listed(args.also)
-    package = {"name": args.name, "model_version": args.model_version, "url": args.url}
-    done = export(args.bundle, args.out, dataset=args.dataset, also=also, **package, warn=warn)
+    package = PackageNames(args.name, args.model_version, args.url)
+    done = export(args.bundle, args.out, dataset=args.dataset, also=also, package=package, warn=warn)
     facts = done.facts
     simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts.simulated else []
     emit(
@@ -72,7 +72,7 @@ def _patch(args: argparse.Namespace) -> int:
             words = f"--{option.replace('_', '-')}"
             raise ConfigError(f"{words} is for a whole export: a patch holds no names or versions, so leave it out.")
     done = export_patch(args.bundle, args.out, export=args.patch_for, dataset=args.dataset, warn=warn)
-    emit(args, done.to_dict(), [f"{done.path}: {done.bytes:,} bytes, for plush_patch on a toy with {args.patch_for}"])
+    emit(args, done.to_json(), [f"{done.path}: {done.bytes:,} bytes, for plush_patch on a toy with {args.patch_for}"])
     return 0
 
 

@@ -8,18 +8,21 @@ import math
 import os
 import queue
 import sys
-import textwrap
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from queue import SimpleQueue
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from plushsense.core.errors import printable
 from plushsense.recording.recorder import Recorder
 from plushsense.recording.status import RecorderStatus
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.live import Live
 
 END = "\x04"
 """The key that a source returns when it has ended."""
@@ -151,7 +154,6 @@ class KeyRepeatFilter:
         return repeated
 
 
-_BOLD, _DIM, _RED, _GREEN, _BLUE, _OFF = "\x1b[1m", "\x1b[2m", "\x1b[31;1m", "\x1b[32;1m", "\x1b[34;1m", "\x1b[0m"
 _REMIND_S = 20.0
 _WIDEST = 90
 
@@ -164,101 +166,75 @@ KEYS = {
     "finished": "q close   r redo the last   b back   n note",
     "stopped": "",
 }
+_SIGNAL = {
+    "good": ("good", ""),
+    "fair": ("fair: some readings are lost or damaged; bring the toy nearer", ""),
+    "poor": ("POOR: many readings are lost or damaged; bring the toy nearer, check its battery", "bold red"),
+    "none": ("NONE: the toy sends nothing", "bold red"),
+    "unreadable": ("UNREADABLE: the toy sends lines, but none is a frame", "bold red"),
+}
+_STATES = {
+    "saving": ("SAVING …", "bold blue"),
+    "paused": ("PAUSED.  Press p to resume", "bold blue"),
+    "finished": ("ALL RECORDED.  Press q to close", "bold green"),
+    "stopped": ("STOPPED", "bold green"),
+}
 
 
 def _state(s: RecorderStatus) -> tuple[str, str]:
-    """Return the line that describes the state and the key to press, and its colour."""
+    """Return the line that describes the state and the key to press, and its style."""
     if s.state == "idle":
         if s.signal == "none":
-            return "WAITING FOR THE TOY: switch it on, bring it near", _RED
+            return "WAITING FOR THE TOY: switch it on, bring it near", "bold red"
         if s.signal == "unreadable":
-            return "THE TOY CANNOT BE READ: is --layout right, and the cable sound?", _RED
-        return "READY.  Press SPACE, then wait for the countdown", _BLUE
+            return "THE TOY CANNOT BE READ: is --layout right, and the cable sound?", "bold red"
+        return "READY.  Press SPACE, then wait for the countdown", "bold blue"
     if s.state == "countdown":
-        return f"GET READY … {math.ceil(s.countdown_s)}", _BLUE
+        return f"GET READY … {math.ceil(s.countdown_s)}", "bold blue"
     if s.state == "recording":
         if s.away:
-            return f"RECORDING  {s.elapsed_s:4.1f} s   TOY DISCONNECTED: check cable and battery", _RED
+            return f"RECORDING  {s.elapsed_s:4.1f} s   TOY DISCONNECTED: check cable and battery", "bold red"
         if s.left_s < _REMIND_S and s.elapsed_s > _REMIND_S:
-            return f"STILL RECORDING  {s.elapsed_s:4.1f} s   SPACE stops; stops by itself in {s.left_s:.0f} s", _RED
-        return f"RECORDING  {s.elapsed_s:4.1f} s   Press SPACE when the gesture is over", _GREEN
-    if s.state == "saving":
-        return "SAVING …", _BLUE
-    if s.state == "paused":
-        return "PAUSED.  Press p to resume", _BLUE
-    return ("ALL RECORDED.  Press q to close" if s.state == "finished" else "STOPPED"), _GREEN
+            left = f"SPACE stops; stops by itself in {s.left_s:.0f} s"
+            return f"STILL RECORDING  {s.elapsed_s:4.1f} s   {left}", "bold red"
+        return f"RECORDING  {s.elapsed_s:4.1f} s   Press SPACE when the gesture is over", "bold green"
+    return _STATES[s.state]
 
 
-def _signal(s: RecorderStatus) -> list[tuple[str, str]]:
-    """Return two lines that describe the signal, each with its colour."""
-    words = {
-        "good": ("good", ""),
-        "fair": ("fair: some readings are lost or damaged; bring the toy nearer", ""),
-        "poor": ("POOR: many readings are lost or damaged; bring the toy nearer, check its battery", _RED),
-        "none": ("NONE: the toy sends nothing", _RED),
-        "unreadable": ("UNREADABLE: the toy sends lines, but none is a frame", _RED),
-    }
-    rate = f"   {s.rate_hz:.0f} readings a second" if s.rate_hz else ""
-    text, colour = words[s.signal]
-    return [
-        (f"Signal {text}{rate}", colour),
-        (
-            f"jitter {s.jitter_ms:.1f} ms   lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   "
-            f"gaps {s.gaps}   reconnected {s.reconnects}",
-            _DIM,
-        ),
-    ]
+def view(s: RecorderStatus, title: str, notices: Sequence[str], typing: str | None) -> RenderableType:
+    """Return the screen. What is to be done stands at the top, because a low terminal cuts off the lines below."""
+    from rich.console import Group
+    from rich.padding import Padding
+    from rich.progress_bar import ProgressBar
+    from rich.text import Text
 
+    rows: list[RenderableType] = []
 
-def lines(
-    s: RecorderStatus, title: str, notices: Sequence[str], typing: str | None, width: int, height: int = 1000
-) -> list[str]:
-    """Format the screen as at most ``height`` lines, each no wider than ``width``.
+    def put(text: str, style: str = "", indent: int = 0) -> None:
+        rows.append(Padding(Text(printable(text, lines=True), style), (0, 0, 0, indent)))
 
-    If there are too many lines, those with the highest rank are left out first (blank lines, rules, counters), and the
-    gesture, the state and the keys last.
-    """
-    out: list[tuple[int, str]] = []
-
-    def put(rank: int, text: str, colour: str = "", indent: str = "") -> None:
-        for line in textwrap.wrap(printable(text, lines=True), max(1, width - len(indent))) or [""]:
-            out.append((rank, f"{indent}{colour}{line}{_OFF if colour else ''}"))
-
-    rule = "─" * width
-    put(4, title, _BOLD)
-    for notice in notices:
-        put(3, notice, _RED)
-    put(2, f"{s.done} of {s.steps} recorded" + (f", {s.skipped} skipped" if s.skipped else ""))
-    put(6, _bar(s, width))
-    put(8, "")
     if s.state not in ("finished", "stopped"):
         again = "   (recorded before; this one replaces it)" if s.existing else ""
-        name = f"{_BOLD}{printable(s.step.gesture)[: max(1, width - 2)]}{_OFF}"
-        out.append((0, f"  {name}   {s.step.repetition} of {s.repetitions}{again}"))
-        put(8, "")
-        put(1, s.step.prompt, _BOLD, "  ")
-        put(8, "")
-    put(0, *_state(s), "  ")
-    put(8, "")
-    put(1, s.message, "", "  " if s.message else "")
-    put(7, rule)
+        put(f"{s.step.gesture}   {s.step.repetition} of {s.repetitions}{again}", "bold", 2)
+        put(s.step.prompt, "bold", 2)
+    put(*_state(s), 2)
+    put(s.message, "", 2)
+    put(f"Note: {typing}▏   (Enter saves it, Esc discards it)" if typing is not None else KEYS[s.state])
+    put(f"{s.done} of {s.steps} recorded" + (f", {s.skipped} skipped" if s.skipped else ""))
+    rows.append(ProgressBar(total=max(1, s.steps), completed=s.done))
+    put("")
+    put(title, "bold")
+    for notice in notices:
+        put(notice, "bold red")
     if s.next_step is not None and s.state != "finished":
-        put(5, f"Next  {s.next_step.gesture}, {s.next_step.repetition} of {s.repetitions}")
-    for rank, (text, colour) in zip((3, 6), _signal(s), strict=True):
-        put(rank, text, colour)
+        put(f"Next  {s.next_step.gesture}, {s.next_step.repetition} of {s.repetitions}")
+    text, style = _SIGNAL[s.signal]
+    put(f"Signal {text}" + (f"   {s.rate_hz:.0f} readings a second" if s.rate_hz else ""), style)
+    counts = f"lost {s.lost}   unreadable {s.malformed}   out of range {s.garbage}   gaps {s.gaps}"
+    put(f"jitter {s.jitter_ms:.1f} ms   {counts}   reconnected {s.reconnects}", "dim")
     if s.file:
-        put(7, f"Last  {s.file}", _DIM)
-    put(7, rule)
-    put(1, f"Note: {typing}▏   (Enter saves it, Esc discards it)" if typing is not None else KEYS[s.state])
-    while len(out) > max(1, height):
-        worst = max(rank for rank, _ in out)
-        del out[max(n for n, (rank, _) in enumerate(out) if rank == worst)]
-    return [text for _, text in out]
-
-
-def _bar(s: RecorderStatus, width: int) -> str:
-    full = round(width * s.done / max(1, s.steps))
-    return "█" * full + "░" * (width - full)
+        put(f"Last  {s.file}", "dim")
+    return Group(*rows)
 
 
 class Screen:
@@ -266,30 +242,31 @@ class Screen:
 
     def __init__(self, recorder: Recorder, title: str, notices: Sequence[str] = ()) -> None:
         """Prepare the screen; on a terminal, ``notices`` are displayed below ``title``."""
-        self._title = title
-        self._notices = notices
-        self._terminal = sys.stderr.isatty()
+        self._title, self._notices = title, notices
         self._line = self._message = ""
         # The recorder's threads only queue messages, so that a blocked log cannot delay frames; the caller writes them.
         self._messages: SimpleQueue[str] = SimpleQueue()
-        if self._terminal:
-            if sys.platform == "win32":
-                os.system("")  # enables escape sequences in the console
-            # Switch to the alternate screen, hide the cursor, and do not wrap lines.
-            sys.stderr.write("\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J")
+        self._live: Live | None = None
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.live import Live
+
+            console = Console(stderr=True, highlight=False)
+            self._live = Live(
+                console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
+            )
+            self._live.start()
         else:
             recorder.subscribe(self._on_change)
 
     def draw(self, status: RecorderStatus, typing: str | None = None) -> None:
         """Draw the status; ``typing`` is the note that is being typed, if any."""
         self._write_messages()
-        if self._terminal:
-            # Ask for the size of standard error, because standard output may be a file. Some terminals report 0.
-            size = os.get_terminal_size(sys.stderr.fileno())
-            width, height = (size.columns or 80) - 1, (size.lines or 24) - 1
-            screen = lines(status, self._title, self._notices, typing, max(1, min(_WIDEST, width)), height)
-            sys.stderr.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in screen) + "\x1b[J")
-            sys.stderr.flush()
+        if self._live is not None:
+            from rich.constrain import Constrain
+
+            screen = view(status, self._title, self._notices, typing)
+            self._live.update(Constrain(screen, _WIDEST), refresh=True)
 
     def _on_change(self, change: str, s: RecorderStatus) -> None:
         """Queue a line that describes a change, for a log or a screen reader."""
@@ -320,7 +297,6 @@ class Screen:
         """Write the remaining messages and restore the terminal, unless it is closed."""
         with contextlib.suppress(OSError):
             self._write_messages()
-        if self._terminal:
+        if self._live is not None:
             with contextlib.suppress(OSError):
-                sys.stderr.write("\x1b[?7h\x1b[?25h\x1b[?1049l")
-                sys.stderr.flush()
+                self._live.stop()

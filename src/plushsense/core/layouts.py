@@ -22,6 +22,7 @@ HOST_MS = "host_ms"
 MAGNITUDE_FRACTION_BITS = 4
 GRAVITY_FRACTION_BITS = 4
 GRAVITY_STATE_BITS = 10  # fraction bits of the running mean itself
+MOST_GRAVITY = 1 << (29 - GRAVITY_STATE_BITS)  # size of a component whose running mean and its changes fit 32 bits
 GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (docs/measurements/people.md)
 CALIBRATION_BLOCK_S = 0.32
 MOST_CALIBRATED_SENSORS = 64
@@ -41,11 +42,6 @@ _NUMBERED = re.compile(r"(?:ch(?:an(?:nel)?)?)?[\W\d_]*", re.IGNORECASE)
 def magnitude_limit(n: int) -> int:
     """Return the largest size, 2²⁷ / √n, of ``n`` components whose magnitude with fraction bits stays below 2³¹."""
     return math.isqrt((2 ** (62 - 2 * MAGNITUDE_FRACTION_BITS) - 1) // n)
-
-
-def gravity_limit() -> int:
-    """Return the largest size, 2¹⁹, of a component of gravity whose running mean and its changes fit 32 bits."""
-    return 1 << (29 - GRAVITY_STATE_BITS)
 
 
 @dataclass(frozen=True)
@@ -260,15 +256,12 @@ class Layout:
             yield f"gaps of {self.gap_ms} ms have more than {MOST_GAP_VALUES} values in {self.n_channels} channels."
 
     def _problems_of(self, derived: Derived) -> Iterator[str]:
-        if derived.kind not in DERIVED_KINDS:
+        if derived.kind not in DERIVED_KINDS or not derived.of or (derived.kind == "gravity" and len(derived.of) > 1):
             yield (
-                f"derived channel '{derived.name}' has the kind '{derived.kind}'; accepted are magnitude and gravity."
+                f"derived channel '{derived.name}' is the {derived.kind} of {', '.join(derived.of) or 'nothing'}: "
+                "accepted are the magnitude of one or more channels, and the gravity of one."
             )
-        if not derived.of:
-            yield f"derived channel '{derived.name}' has no source: fill in of."
-        if derived.kind == "gravity" and len(derived.of) != 1:
-            yield f"derived channel '{derived.name}' is the gravity along one axis, not {len(derived.of)}."
-        limit = gravity_limit() if derived.kind == "gravity" else magnitude_limit(len(derived.of))
+        limit = MOST_GRAVITY if derived.kind == "gravity" else magnitude_limit(len(derived.of))
         for name in derived.of:
             at = self.index(name)
             low, high = (edge[at] - self.zero_int[at] for edge in (self.valid_min_int, self.valid_max_int))
@@ -280,28 +273,21 @@ class Layout:
                 )
 
     def _problems_of_calibration(self, kinds: Mapping[str, str]) -> Iterator[str]:
-        if not self.self_calibration:
-            return
         named, sensors = self.self_calibration, self.calibrated_sensors
         axes = [self.names[at] for sensor in sensors for at in sensor]
         if twice := [name for name in dict.fromkeys(named) if named.count(name) > 1 or axes.count(name) > 1]:
             yield f"self_calibration has {', '.join(twice)} twice, by name or as axes of two vectors: accepted is once."
-        for vector in self.vectors:
-            if 0 < len(set(vector) & set(named)) < len(set(vector)):
-                yield (
-                    f"self_calibration names {', '.join(a for a in vector if a in named)}: accepted are all three axes "
-                    f"of a vector, here {', '.join(vector)}."
-                )
-        for (name,) in (tuple(self.names[at] for at in sensor) for sensor in sensors if len(sensor) == 1):
-            if kinds[name] == ACCELERATION:
-                known = "; ".join(", ".join(v) for v in self.vectors if kinds[v[0]] == ACCELERATION) or "none"
-                yield f"self_calibration names {name}: accepted are all three axes of an accelerometer, here {known}."
-            elif kinds[name] in (BINARY, COUNT):
-                yield f"self_calibration names {name}: a channel of the kind '{kinds[name]}' has no scale to find."
         if len(sensors) > MOST_CALIBRATED_SENSORS:
             yield f"self_calibration names {len(sensors)} sensors: accepted are up to {MOST_CALIBRATED_SENSORS}."
         for name in named:
-            at, most = self.index(name), MOST_CALIBRATED if kinds[name] == ACCELERATION else MOST_CALIBRATED_OTHER
+            at = self.index(name)
+            most = MOST_CALIBRATED if kinds[name] == ACCELERATION else MOST_CALIBRATED_OTHER
+            of = next((vector for vector in self.vectors if name in vector), ())
+            if not set(of) <= set(named) or (kinds[name] == ACCELERATION and not of):
+                known = "; ".join(map(", ".join, self.vectors)) or "none"
+                yield f"self_calibration names {name}: accepted are all three axes of a vector, here {known}."
+            if kinds[name] in (BINARY, COUNT):
+                yield f"self_calibration names {name}: a channel of the kind '{kinds[name]}' has no scale to find."
             if max(abs(int(self.valid_min_int[at])), abs(int(self.valid_max_int[at]))) > most:
                 yield (
                     f"channel '{name}' is in self_calibration but is valid from {self.valid_min_int[at]} to "

@@ -6,13 +6,14 @@ header and changes the separator to ``;``. A stream (``fulldatastream.csv``) has
 
 from __future__ import annotations
 
+import builtins
 import io
 import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,15 +173,9 @@ class Frames:
 
     def slice(self, start: int, stop: int) -> Frames:
         """Return rows ``start`` to ``stop`` (exclusive) as a view."""
-        part = slice(start, stop)
-        return Frames(
-            self.values[part],
-            self.device_ms[part],
-            None if self.host_ms is None else self.host_ms[part],
-            None if self.labels is None else self.labels[part],
-        )
+        return self.take(slice(start, stop))
 
-    def take(self, rows: NDArray[np.int64]) -> Frames:
+    def take(self, rows: NDArray[np.int64] | builtins.slice[int]) -> Frames:
         """Return the rows with the indices ``rows``."""
         host, labels = self.host_ms, self.labels
         return Frames(
@@ -191,8 +186,7 @@ class Frames:
         )
 
 
-@dataclass(frozen=True)
-class RecordingName:
+class RecordingName(NamedTuple):
     """The parts of a recording's file name."""
 
     label: str
@@ -402,14 +396,12 @@ def read_stream(path: str | os.PathLike[str], layout: Layout, data: bytes | None
 
 
 def _columns(frames: Frames, layout: Layout) -> Iterator[list[str]]:
+    delays = np.diff(frames.device_ms, prepend=frames.device_ms[:1])
     host = frames.device_ms if frames.host_ms is None else frames.host_ms
+    clocks = {HOST_MS: host, DEVICE_MS: frames.device_ms, DELAY_MS: delays}
     for key in layout.csv.columns:
-        if key == HOST_MS:
-            yield [str(v) for v in host.tolist()]
-        elif key == DEVICE_MS:
-            yield [str(v) for v in frames.device_ms.tolist()]
-        elif key == DELAY_MS:
-            yield [str(v) for v in np.diff(frames.device_ms, prepend=frames.device_ms[:1]).tolist()]
+        if key in clocks:
+            yield [str(v) for v in clocks[key].tolist()]
         elif key == "label":
             yield [""] * len(frames) if frames.labels is None else [str(v) for v in frames.labels]
         else:

@@ -28,7 +28,7 @@ from plushsense.evaluation.scores import (
     with_accuracy,
     write_predictions,
 )
-from plushsense.jobs.journal import Journal, Result
+from plushsense.jobs.journal import Result
 from plushsense.jobs.pool import JobsSpec, Report
 from plushsense.jobs.progress import JobProgress
 from plushsense.jobs.study import StudyPart, run_study
@@ -212,33 +212,39 @@ class EvaluationResult:
         )
 
 
+@dataclass(frozen=True)
+class CrossvalSpec:
+    """Settings of a cross-validation.
+
+    Attributes:
+        seed: seed of the split.
+        validation: whether to hold back windows for validation; without it they are trained on.
+        jobs: folds at a time, and the journal of finished folds, which are looked up first.
+        key: with a journal, everything that ``fit_predict`` depends on besides windows and folds (network, schedule,
+            its seed).
+    """
+
+    seed: int = 0
+    validation: bool = True
+    jobs: JobsSpec = field(default_factory=JobsSpec)
+    key: Mapping[str, Any] | None = None
+
+
 def evaluate(
-    train_windows: WindowSet,
-    score_windows: WindowSet,
+    train: WindowSet,
+    score: WindowSet,
     split: Split,
     fit_predict: FitPredict,
+    spec: CrossvalSpec | None = None,
     *,
-    journal: Journal | None = None,
-    key: Mapping[str, Any] | None = None,
-    workers: int = 1,
-    cluster: str | None = None,
-    seed: int = 0,
-    validation: bool = True,
     shared_rows: SharedRows = tuple,
     progress: Callable[[JobProgress], None] | None = None,
 ) -> EvaluationResult:
     """Train and score a model on each fold of ``split``.
 
     Args:
-        train_windows, score_windows: the same recordings, possibly cut with another context; one set for both is fine.
+        train, score: the same recordings, possibly cut with another context; one set for both is fine.
         split: how the recordings or windows are divided (see `plushsense.scoring.splits.parse_split`).
-        journal: where finished folds are stored, and looked up first.
-        key: with a journal, everything that ``fit_predict`` depends on besides windows and folds (network, schedule,
-            its seed).
-        workers: folds at a time, each in a process of its own.
-        cluster: address of a Ray cluster that runs the folds instead.
-        seed: seed of the split.
-        validation: whether to hold back windows for validation; without it they are trained on.
         shared_rows: called for the argument ``shared_rows`` of `audit_leakage`.
         progress: called when a fold reports an epoch, with (epoch, epochs, row of the history) as its message, or is
             done.
@@ -246,34 +252,34 @@ def evaluate(
     Raises:
         BadInput: for a split that cannot be made; any error that ``fit_predict`` raises.
     """
-    if journal is not None and key is None:
-        raise ConfigError("A journal needs a key that identifies what is trained: give evaluate(..., key={...}).")
-    folds = fold_windows(train_windows, score_windows, split, seed)
-    folds = folds if validation else train_on_validation(folds)
-    hashes = [windows_fingerprint(train_windows)]
-    hashes.append(hashes[0] if score_windows is train_windows else windows_fingerprint(score_windows))
-    outcomes = run_study(
+    spec = spec or CrossvalSpec()
+    if spec.jobs.journal is not None and spec.key is None:
+        raise ConfigError("A journal needs a key that identifies what is trained: give CrossvalSpec(key={...}).")
+    folds = fold_windows(train, score, split, spec.seed)
+    folds = folds if spec.validation else train_on_validation(folds)
+    hashes = [windows_fingerprint(train)]
+    hashes.append(hashes[0] if score is train else windows_fingerprint(score))
+    return run_study(
         [StudyPart(fold.name, {"fold": fold_fingerprint(fold)}, fold) for fold in folds],
         _FoldWork(fit_predict),
-        lambda study: study.results,
-        key={"version": _VERSION, "key": dict(key or {}), "windows": hashes},
-        shared=(train_windows, None if score_windows is train_windows else score_windows),
-        spec=JobsSpec(workers, journal=journal, cluster=cluster),
+        lambda study: _result(study.results, folds, (train, score), split, spec.seed, shared_rows),
+        key={"version": _VERSION, "key": dict(spec.key or {}), "windows": hashes},
+        shared=(train, None if score is train else score),
+        spec=spec.jobs,
         progress=progress,
     )
-    return _result(outcomes, folds, train_windows, score_windows, split, seed, shared_rows)
 
 
 def _result(
     outcomes: Sequence[Result],
     folds: Sequence[Fold],
-    train_windows: WindowSet,
-    score_windows: WindowSet,
+    windows: tuple[WindowSet, WindowSet],
     split: Split,
     seed: int,
     shared_rows: SharedRows,
 ) -> EvaluationResult:
-    """Score the outcomes of all folds."""
+    """Score the outcomes of all folds; ``windows`` are those to train on and those that were scored."""
+    train, score = windows
     records = [
         FoldRecord(
             fold.name,
@@ -284,22 +290,25 @@ def _result(
         )
         for fold, outcome in zip(folds, outcomes, strict=True)
     ]
-    tested = [(fold.name, fold.test) for fold in folds]
-    predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
-    scores = compute_scores(predictions, records, score_windows.affects, split.separates_people)
+
+    def scored(name: str) -> tuple[Predictions, Scores]:
+        tested = [(fold.name, fold.test) for fold in folds]
+        predictions = gather_predictions(score, tested, [outcome[name] for outcome in outcomes])
+        return predictions, compute_scores(predictions, records, score.affects, split.separates_people)
+
+    predictions, scores = scored("probabilities")
     int8 = None
     if all("deployed" in outcome for outcome in outcomes):
-        deployed = gather_predictions(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
-        after = compute_scores(deployed, records, score_windows.affects, split.separates_people)
+        deployed, after = scored("deployed")
         int8 = compare_deployed(scores, after, predictions, deployed)
     return EvaluationResult(
         split=split,
-        context=context_of(score_windows),
-        train_context=context_of(train_windows),
+        context=context_of(score),
+        train_context=context_of(train),
         seeds=[seed],
         scores=scores,
-        leakage=audit_leakage(train_windows, score_windows, folds, shared_rows()),
-        self_calibration=score_windows.self_calibration,
+        leakage=audit_leakage(train, score, folds, shared_rows()),
+        self_calibration=score.self_calibration,
         int8=int8,
         histories=[with_accuracy(outcome["history"], split.separates_people) for outcome in outcomes],
         predictions=predictions,

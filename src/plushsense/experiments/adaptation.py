@@ -390,7 +390,7 @@ def evaluate_adapting(
         ConfigError: for a split that does not keep people apart, or too small a ``use``.
         BadInput: when nobody has more than ``use`` recordings of a gesture.
     """
-    run = prepare(dataset, config or from_settings(**settings), warn)
+    run = prepare(dataset, from_settings(config, **settings), warn)
     spec = PersonalSpec()
     if use < spec.least:
         raise ConfigError(f"--use {use} is too few: accepted are {spec.least} and more recordings of each gesture.")

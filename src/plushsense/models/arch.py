@@ -8,9 +8,10 @@ A first token ``v`` with a kernel length, as in ``v14_19d2_19d4``, is a vector l
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, NamedTuple, NoReturn, cast, get_args
+from typing import Any, Literal, NamedTuple, NoReturn, TypedDict, Unpack, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,35 +35,34 @@ class Symbol(NamedTuple):
         return len(self.layers) + (self.vector is not None)
 
 
+_N = "[1-9][0-9]{0,3}"
+_LAYER = f"{_N}(?:d{_N})?"
+_SYMBOL = re.compile(f"(?:v({_N})_)?({_LAYER}(?:_{_LAYER}){{0,{MAX_LAYERS - 1}}})")
+_LAYERS_BEGIN = f"(?:{_LAYER}_){{0,{MAX_LAYERS - 1}}}(?:{_N}(?:d(?:{_N})?)?)?"
+_SYMBOL_BEGIN = re.compile(f"v(?:{_N}(?:_{_LAYERS_BEGIN})?)?|{_LAYERS_BEGIN}")
+_SYMBOL_FORM = (
+    f"accepted are up to {MAX_LAYERS} kernel lengths joined by '_', each with d and its dilation where it has one, as "
+    f"in 14d1_39d2_41d4, and before them v and the kernel length of a vector layer; numbers are 1 to {MAX_NUMBER}"
+)
+_FILTERS_BEGIN = re.compile(f"(?: *{_N} *,)* *(?:{_N} *)?")
+
+
 def parse_symbol(spec: str) -> Symbol:
     """Return the layers of a symbol.
 
     Raises:
         ArchError: with the symbol and a caret under the first invalid character.
     """
-    if not spec:
-        fail("nothing is given: write kernel lengths joined by '_', as in 14d1_39d2_41d4", spec, 0)
-    layers: list[tuple[int, int]] = []
-    vector, at = None, 0
-    if spec.startswith(VECTOR):
-        vector, at = _number(spec, 1, "the kernel length of the vector layer")
-        if spec[at : at + 1] != "_":
-            fail("a vector layer has no dilation, and at least one more layer after '_'", spec, at)
-        at += 1
-    while True:
-        if len(layers) == MAX_LAYERS:
-            fail(f"more than {MAX_LAYERS} layers: take some away", spec, at)
-        kernel, at = _number(spec, at, f"the kernel length of layer {len(layers) + 1}")
-        dilation = 1
-        if spec[at : at + 1] == "d":
-            dilation, at = _number(spec, at + 1, f"the dilation of layer {len(layers) + 1}")
-        layers.append((kernel, dilation))
-        if at == len(spec):
-            return Symbol(vector, tuple(layers))
-        if spec[at] != "_":
-            known = "'_' or the end" if "d" in spec[max(spec.rfind("_", 0, at), 0) : at] else "'d', '_' or the end"
-            fail(f"unknown token {spec[at]!r}: accepted here are {known}", spec, at)
-        at += 1
+    found = _SYMBOL.fullmatch(spec)
+    if found is None:
+        fail(_SYMBOL_FORM, spec, _end(_SYMBOL_BEGIN, spec))
+    layers = (layer.partition("d") for layer in found[2].split("_"))
+    return Symbol(int(found[1]) if found[1] else None, tuple((int(k), int(d or 1)) for k, _, d in layers))
+
+
+def _end(begin: re.Pattern[str], text: str) -> int:
+    match = begin.match(text)
+    return match.end() if match else 0
 
 
 def symbol_at_rate(spec: str, rate_hz: float) -> str:
@@ -105,44 +105,14 @@ def _scaled(spec: str, factor: float, shortest: int) -> str:
 
 def parse_filters(text: str) -> tuple[int, ...]:
     """Return the filter counts of ``"8,12,16"``; raise ArchError for anything but whole numbers from 1."""
-    counts: list[int] = []
-    at = 0
-    while True:
-        at += len(text[at:]) - len(text[at:].lstrip(" "))
-        count, at = _number(text, at, f"filter count {len(counts) + 1}", symbol=False)
-        counts.append(count)
-        at += len(text[at:]) - len(text[at:].lstrip(" "))
-        if at == len(text):
-            return tuple(counts)
-        if text[at] != ",":
-            fail(
-                f"unknown token {text[at]!r}: write counts joined by commas, as in 8,12,16",
-                text,
-                at,
-                symbol=False,
-            )
-        at += 1
+    if not re.fullmatch(f" *{_N} *(?:, *{_N} *)*", text):
+        fail("write counts joined by commas, as in 8,12,16", text, _end(_FILTERS_BEGIN, text), symbol=False)
+    return tuple(map(int, text.split(",")))
 
 
 def slashed(filters: Iterable[int]) -> str:
     """Return filter counts joined by slashes: ``8/12/16``."""
     return "/".join(map(str, filters))
-
-
-def _number(text: str, at: int, name: str, symbol: bool = True) -> tuple[int, int]:
-    """Return the number that starts at ``at``, 1 to MAX_NUMBER, and the position after it."""
-    end = at
-    while end < len(text) and text[end] in "0123456789":
-        end += 1
-    if end == at:
-        is_missing = at == len(text) or text[at] in "_,"
-        problem = "nothing stands here" if is_missing else f"unknown token {text[at]!r}"
-        fail(f"{problem}: {name} is expected, a whole number from 1", text, at, symbol)
-    if text[at:end].strip("0") == "":
-        fail(f"{name} is 0: the smallest is 1", text, at, symbol)
-    if end - at > 9 or int(text[at:end]) > MAX_NUMBER:
-        fail(f"{name} is too large: the largest is {MAX_NUMBER}", text, at, symbol)
-    return int(text[at:end]), end
 
 
 def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
@@ -259,6 +229,18 @@ class VectorLayer:
         return 3 * self.vectors * self.filters * self.kernel
 
 
+class ArchSettings(TypedDict, total=False):
+    """The settings of `Arch` that have a default and are no layers."""
+
+    channels: int
+    classes: int
+    padding: str
+    norm: str
+    window: int
+    step: int
+    pool: int | None
+
+
 @dataclass(frozen=True)
 class Arch:
     """The structure of a network, without its weights.
@@ -325,22 +307,11 @@ class Arch:
 
     @classmethod
     def parse(
-        cls,
-        spec: str,
-        filters: str | Sequence[int],
-        *,
-        channels: int = 11,
-        classes: int = 18,
-        padding: str = "stream",
-        norm: str = "batch",
-        window: int = 250,
-        step: int = 5,
-        pool: int | None = None,
-        vectors: int = 1,
+        cls, spec: str, filters: str | Sequence[int], *, vectors: int = 1, **settings: Unpack[ArchSettings]
     ) -> Arch:
         """Build a network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra ones are ignored).
 
-        ``vectors`` is their number, besides gravity, for a symbol with a vector layer.
+        ``vectors`` is their number, besides gravity, for a symbol with a vector layer; ``settings`` are the others.
 
         Raises:
             ArchError: for an invalid symbol (with a caret under the character) or setting.
@@ -364,7 +335,7 @@ class Arch:
         if shape.vector is not None:
             vector, counts = VectorLayer(shape.vector, counts[0], vectors), counts[1:]
         layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape.layers, counts, strict=False))
-        return cls(layers, channels, classes, cast(Padding, padding), cast(Norm, norm), window, step, pool, vector)
+        return cls(layers, vector=vector, **cast(Any, settings))
 
     @property
     def symbol(self) -> str:

@@ -83,8 +83,8 @@ def render(
         dataset=dataset_rows(dataset),
         recordings=recordings,
         metrics=column_metrics(),
-        comparison=comparison_rows(named),
-        subjects=subject_rows(named),
+        comparison=_comparison_rows(named),
+        subjects=_subject_rows(named),
         evaluations=[_evaluation(f"E{i}", evaluation) for i, evaluation in enumerate(named, start=1)],
         models=cards,
     )
@@ -104,7 +104,7 @@ def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "spread": wording.describe_spread(evaluation),
         "metrics": metric_table(evaluation),
         "contexts": context_table(evaluation),
-        "deployed": deployed_values(evaluation),
+        "deployed": _deployed_values(evaluation),
         "rest_apart": wording.averaged_over(evaluation) == "subjects",
         "nobody": nobody
         and {name: count(nobody.get(name)) for name in ("recordings", "windows")}
@@ -116,7 +116,7 @@ def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
                 ("by gesture", evaluation.get("confusion")),
                 ("by affect", evaluation.get("confusion_affect")),
             )
-            for rows, frequent in [(confusion_rows(confusion), frequent_confusions(confusion))]
+            for rows, frequent in [(_confusion_rows(confusion), frequent_confusions(confusion))]
             if frequent or (rows and len(rows["labels"]) > 1)
         ],
         "curves": data_uri(training_curves(histories)) if histories else None,
@@ -135,7 +135,7 @@ def _model(model: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def comparison_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _comparison_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return one row for each evaluation with its contexts and scores."""
     rows = []
     for i, evaluation in enumerate(evaluations, start=1):
@@ -204,7 +204,7 @@ def context_table(evaluation: Mapping[str, Any]) -> Table | None:
     return Table("contexts", "By context", columns, rows) if rows else None
 
 
-def deployed_values(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
+def _deployed_values(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return means of the 8-bit networks' scores and a table by person or fold; None if they were not evaluated."""
     int8 = evaluation.get("int8")
     if not isinstance(int8, Mapping):
@@ -230,7 +230,7 @@ def deployed_values(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
     }
 
 
-def subject_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _subject_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return one row for each person with the scores in each evaluation, or dashes if it does not have the person."""
     tables = [{str(row.get("subject")): row for row in evaluation.get("subjects") or []} for evaluation in evaluations]
     names = sorted({name for table in tables for name in table}, key=_natural)
@@ -276,7 +276,7 @@ def _confusion(confusion: Any) -> tuple[list[str], NDArray[Any]]:
     return (labels if counts.shape == (len(labels), len(labels)) else []), counts
 
 
-def confusion_rows(confusion: Any) -> dict[str, Any] | None:
+def _confusion_rows(confusion: Any) -> dict[str, Any] | None:
     """Return a confusion matrix ({labels, counts}) as rows of cells with count, percent and shade.
 
     None without a matrix, and with too many labels (see `frequent_confusions`).

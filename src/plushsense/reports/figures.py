@@ -10,6 +10,7 @@ import io
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,8 +21,6 @@ from plushsense.core.errors import ConfigError, need
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.text import Annotation
-    from matplotlib.transforms import Bbox
 
 # Okabe and Ito's blue and vermillion, which colour-blind readers can distinguish; line styles differ as well.
 _TRAIN, _VALIDATION = ("#0072b2", "-", "training"), ("#d55e00", "--", "validation")
@@ -53,27 +52,16 @@ def confusion(labels: Sequence[str], counts: Any, *, title: str = "") -> Figure:
     side = max(k * _CELL_IN, 2.0)
     figure = new_figure(side + longest + 0.9, side + longest + 0.9)
     axes = figure.add_subplot()
-    shares = row_shares(table)
+    shades = [[shade(float(share)) for share in row] for row in row_shares(table)]
     patch = need("matplotlib.patches", "reports").Rectangle
     size = 8.0 if table.max() < 1000 else 6.5
-    for i in range(k):
-        for j in range(k):
-            background, ink = shade(float(shares[i, j]))
-            edge, width = ("#000000", 1.2) if i == j else ("#ffffff", 0.5)
-            axes.add_patch(
-                patch(
-                    (j - 0.5, i - 0.5),
-                    1,
-                    1,
-                    facecolor=background,
-                    edgecolor=edge,
-                    linewidth=width,
-                    zorder=1 + (i == j),
-                    clip_on=False,
-                )
-            )
-            if table[i, j]:
-                axes.text(j, i, str(int(table[i, j])), ha="center", va="center", color=ink, fontsize=size, zorder=3)
+    for i, j in product(range(k), range(k)):
+        background, ink = shades[i][j]
+        edge = {"edgecolor": "#000000", "linewidth": 1.2} if i == j else {"edgecolor": "#ffffff", "linewidth": 0.5}
+        cell = patch((j - 0.5, i - 0.5), 1, 1, facecolor=background, zorder=1 + (i == j), clip_on=False, **edge)
+        axes.add_patch(cell)
+        if table[i, j]:
+            axes.text(j, i, str(int(table[i, j])), ha="center", va="center", color=ink, fontsize=size, zorder=3)
     axes.set(xlim=(-0.5, k - 0.5), ylim=(k - 0.5, -0.5), xlabel="Read as", ylabel="Truth", aspect="equal")
     # Labels are user text, in which "$" must not start a formula.
     axes.set_xticks(range(k), labels, rotation=90, parse_math=False)
@@ -195,11 +183,21 @@ def row_shares(counts: NDArray[Any]) -> NDArray[np.float64]:
     return shares
 
 
+# Places of a label around its point: the horizontal and vertical ones of each distance are tried first.
+_DIRECTIONS = sorted(
+    ((float(np.cos(a)), float(np.sin(a))) for a in np.arange(16) * np.pi / 8), key=lambda d: min(abs(d[0]), abs(d[1]))
+)
 _DISTANCES_PT = (9.0, 14.0, 22.0, 32.0, 44.0, 58.0, 74.0, 92.0, 112.0)
-_DIRECTIONS = tuple((float(np.cos(a)), float(np.sin(a))) for a in np.arange(16) * np.pi / 8)
-_POINT_PT = 6.5
-_NEAR_PT = 10.0
-_GAP_PT = 2.5
+_POINT_PT, _GAP_PT = 6.5, 2.5
+_LABEL: dict[str, Any] = {
+    "bbox": {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
+    "arrowprops": {"arrowstyle": "-", "color": "#777777", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 5},
+    "ha": "center",
+    "va": "center",
+    "linespacing": 1.2,
+    "zorder": 6,
+    "parse_math": False,
+}
 
 
 @dataclass(frozen=True)
@@ -221,8 +219,8 @@ def place_labels(
 ) -> None:
     """Write labels beside their points, each at the nearest place where it covers neither a point nor a label.
 
-    A thin line connects a distant label with its point. A label for which there is no free place is left out; the table
-    beside the figure contains it.
+    A thin line connects a label with its point. A label for which there is no free place is left out; the table beside
+    the figure contains it.
 
     Args:
         avoid: straight lines in data coordinates (left, bottom, right, top) that no label may cover.
@@ -241,51 +239,18 @@ def place_labels(
     for (x, y), point in zip(at, points, strict=True):
         if not point.label:
             continue
-        text = _annotation(
-            axes,
-            point,
-            fontsize=size,
-            ha="center",
-            va="center",
-            linespacing=1.2,
-            zorder=6,
-            parse_math=False,
-            bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
-        )
+        place = (point.x, point.y)
+        text = axes.annotate(point.label, place, (0, 0), textcoords="offset points", fontsize=size, **_LABEL)
+        text.set_in_layout(False)  # `constrained` layout must not make room for it
         extent = text.get_window_extent()
         width, height = extent.width + 2 * _GAP_PT * pixel, extent.height
-        boxes = ((d, _free_box(x, y, width, height, d * pixel, taken, inside)) for d in _DISTANCES_PT)
-        distance, box = next(((d, free) for d, free in boxes if free is not None), (0.0, None))
-        if box is None:
+        for distance, (dx, dy) in product(_DISTANCES_PT, _DIRECTIONS):
+            middle_x, middle_y = x + dx * (distance * pixel + width / 2), y + dy * (distance * pixel + height / 2)
+            box = Bbox.from_bounds(middle_x - width / 2, middle_y - height / 2, width, height)
+            within = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
+            if within and not box.count_overlaps(taken):
+                taken.append(box)
+                text.set_position(((middle_x - x) / pixel, (middle_y - y) / pixel))
+                break
+        else:
             text.remove()
-            continue
-        taken.append(box)
-        text.set_position((((box.x0 + box.x1) / 2 - x) / pixel, ((box.y0 + box.y1) / 2 - y) / pixel))
-        if distance > _NEAR_PT:
-            nearest = np.clip((x, y), box.min, box.max)
-            arrow = {"arrowstyle": "-", "color": "#777777", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
-            line = _annotation(axes, LabelledPoint(point.x, point.y, ""), arrowprops=arrow, zorder=4)
-            line.set_position(((nearest[0] - x) / pixel, (nearest[1] - y) / pixel))
-
-
-def _annotation(axes: Axes, point: LabelledPoint, **style: Any) -> Annotation:
-    """Write a label on its point, which `constrained` layout does not make room for."""
-    text = axes.annotate(point.label, (point.x, point.y), xytext=(0, 0), textcoords="offset points", **style)
-    text.set_in_layout(False)
-    return text
-
-
-def _free_box(
-    x: float, y: float, width: float, height: float, distance: float, taken: Sequence[Bbox], inside: Bbox
-) -> Bbox | None:
-    """Return the first free box at a distance from a point, or None; the horizontal and vertical are tried first."""
-    from matplotlib.transforms import Bbox
-
-    for dx, dy in sorted(_DIRECTIONS, key=lambda d: min(abs(d[0]), abs(d[1]))):
-        left = x + dx * (distance + width / 2) - width / 2
-        bottom = y + dy * (distance + height / 2) - height / 2
-        box = Bbox.from_bounds(left, bottom, width, height)
-        within = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
-        if within and not box.count_overlaps(taken):
-            return box
-    return None

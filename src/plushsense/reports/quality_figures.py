@@ -239,8 +239,7 @@ def signals(
 
     Channels of several kinds are drawn as differences from their rest level, each divided by its ``scale``.
     """
-    figure = new_figure(7.4, 2.2)
-    axes = figure.add_subplot()
+    figure, axes = _small(title)
     drawn = list(channels) or list(range(layout.n_channels))
     kinds = {layout.channels[c].unit for c in drawn} | {layout.channels[c].kind for c in drawn}
     at = _thinned(len(frames))
@@ -257,13 +256,12 @@ def signals(
     axes.legend(
         fontsize=6.5, ncols=1 if len(drawn) < 7 else 2, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5)
     )
-    return _finished(figure, axes, title)
+    return figure
 
 
 def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: int = 0, title: str = "") -> Figure:
     """Draw the differences of the device clock between successive rows, and mark ``rows``."""
-    figure = new_figure(7.4, 2.2)
-    axes = figure.add_subplot()
+    figure, axes = _small(title)
     steps = np.diff(frames.device_ms)
     # Always draw the 200 most deviating steps, whatever else is left out.
     far = np.argsort(np.abs(steps - np.median(steps)))[-200:] if len(steps) else np.empty(0, dtype=np.int64)
@@ -277,20 +275,17 @@ def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: in
         axes.set_yticks([-(10.0**p) for p in powers if steps.min() < -100] + [0.0] + [10.0**p for p in powers])
         axes.minorticks_off()
     axes.set_ylabel("ms since previous row", fontsize=8)
-    return _finished(figure, axes, title)
+    return figure
 
 
 def baselines(lows: NDArray[np.float64], layout: Layout, channels: Sequence[int], *, title: str = "") -> Figure:
     """Draw the baselines of channels over a session; ``lows`` has one value for every 10 s."""
-    figure = new_figure(7.4, 2.2)
-    axes = figure.add_subplot()
+    figure, axes = _small(title, "minutes of the session")
     minutes = np.arange(len(lows)) / 6
     for i, c in enumerate(channels[: len(COLOURS)]):
         axes.plot(minutes, lows[:, c], color=COLOURS[i], linewidth=1.2, label=layout.names[c])
     axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
     axes.set_ylabel(f"low level ({layout.channels[channels[0]].unit})", fontsize=8)
-    _finished(figure, axes, title)
-    axes.set_xlabel("minutes of the session", fontsize=8)
     return figure
 
 
@@ -300,14 +295,17 @@ def _mark(axes: Any, rows: Sequence[tuple[int, int]]) -> None:
         axes.axvline(first + 1, color=MARK, linewidth=0.8)
 
 
-def _finished(figure: Figure, axes: Any, title: str) -> Figure:
-    axes.set_xlabel("row", fontsize=8)
+def _small(title: str, x_label: str = "row") -> tuple[Figure, Any]:
+    """Return a small figure and its axes."""
+    figure = new_figure(7.4, 2.2)
+    axes = figure.add_subplot()
+    axes.set_xlabel(x_label, fontsize=8)
     axes.tick_params(labelsize=7.5)
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(x=0.01)
     if title:
         axes.set_title(textwrap.fill(title, 105), fontsize=8, loc="left", parse_math=False)
-    return figure
+    return figure, axes
 
 
 PER_PAGE = 12

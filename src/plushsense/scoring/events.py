@@ -274,8 +274,7 @@ def cost(
     truths: Sequence[Interval],
     events: Sequence[Interval],
     affects: Sequence[str],
-    families: Mapping[str, str],
-    affect_of: Mapping[str, str],
+    kinds: Mapping[str, tuple[str, str]],
     weights: ErrorCosts | None = None,
     late_s: float = LATE_S,
     practice: Sequence[Interval] = (),
@@ -285,7 +284,7 @@ def cost(
     Args:
         truths, events, practice: with gestures as labels; the label of an event may be "".
         affects: affect of each event (E,); "none" if unknown.
-        families, affect_of: family and affect of each gesture; the affect "none" means unknown.
+        kinds: family and affect of each gesture; the affect "none" means unknown.
     """
     weights = weights or ErrorCosts()
     # Of several truths of an event's gesture, the earliest is taken first, in whatever order they are given.
@@ -303,13 +302,14 @@ def cost(
         charges = []
         for i in there.tolist():
             truth, event = labelled[i], events[j]
+            family, affect = kinds[truth.label]
             if event.label == truth.label:
                 charges.append((weights.again if i in right else 0.0, i))
-            elif event.label != UNNAMED and families[event.label] == families[truth.label]:
+            elif event.label != UNNAMED and kinds[event.label][0] == family:
                 charges.append((weights.family, -1))
-            elif "none" in (affects[j], affect_of[truth.label]):
+            elif "none" in (affects[j], affect):
                 charges.append((weights.confused, -1))
-            elif affects[j] != affect_of[truth.label]:
+            elif affects[j] != affect:
                 charges.append((weights.affect, -1))
             else:
                 charges.append((weights.family if event.label == UNNAMED else weights.confused, -1))

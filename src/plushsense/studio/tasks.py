@@ -41,12 +41,11 @@ from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.app.workspace import folder_digest
 from plushsense.training.spec import EpochRow
-from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
 from plushsense.workflow.export import export
-from plushsense.workflow.networks import FIRST_NETWORK, REFIT
+from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people, refits
 from plushsense.workflow.reporting import check_folder
 
@@ -241,7 +240,7 @@ def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
             dataset=spec["dest"],
             progress=lambda step, at, total: reporter.progress(what=step, done=at, total=total),
         )
-    return {"dataset": str(spec["dest"]), "recordings": done["recordings"], "people": done["people"]}
+    return {"dataset": str(spec["dest"]), "recordings": done.recordings, "people": done.people}
 
 
 def run_backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -303,18 +302,17 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
     clock, tuning, epochs = Clock(), int(spec.get("quantize_aware", 0)), config.training.epochs
-    first = epochs if config.windows.context == ANYWHERE and config.anywhere.hard_share > 0 else 0
-    each, again = first + epochs + tuning, refits(config, count_people(open_dataset(spec["dataset"])))
+    each, again = epochs + tuning, refits(config, count_people(open_dataset(spec["dataset"])))
 
     def epoch(at: int, of: int, row: EpochRow) -> None:
         what = str(row.get("what", ""))
         second, part = what.startswith(REFIT), what.removeprefix(REFIT).lstrip(", ")
-        past = {"": first, FIRST_NETWORK: 0}.get(part, first + epochs)
-        stage = "refitting" if second else {"": "training", FIRST_NETWORK: "first_network"}.get(part, "fine-tuning")
+        past = epochs if part else 0
+        stage = "refitting" if second else "fine-tuning" if part else "training"
         scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "accuracy")}
         share = (each * second + past + at) / (each * (1 + again))
         reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(share))
-        if at == of and second == again and past == first and not tuning:
+        if at == of and second == again and not tuning:
             reporter.progress(stage="deciding", epoch=at, epochs=of, share=1.0)
 
     done = train(
@@ -351,7 +349,7 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     def report(at: BudgetProgress) -> None:
         row = {key: value for key, value in at.row.items() if key != "learning_rate"}
         what = str(row.get("what", ""))
-        stage = "refitting" if what.startswith(REFIT) else "first_network" if what == FIRST_NETWORK else at.stage
+        stage = "refitting" if what.startswith(REFIT) else at.stage
         reporter.progress(**row | {"stage": stage, "bundle": at.bundle}, **clock.at(at.share))
 
     settings = spec.get("settings")
@@ -381,16 +379,14 @@ def _evaluation(table: dict[str, Any]) -> dict[str, Any]:
 
 def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Evaluate; return the output folder, the report and the main scores, or the estimate for a dry run."""
-    config = from_settings(**spec.get("settings", {}))
-    if spec.get("split"):
-        config = config.for_split(spec["split"])
+    config = from_settings(**spec.get("settings", {}), split=spec.get("split") or None)
     if spec.get("dry"):
         from plushsense.workflow.estimate import preview_evaluation
 
         return preview_evaluation(spec["dataset"], config, warn=reporter.warn).to_json()
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.workflow.api import evaluate_run
+    from plushsense.workflow.api import FoldsSpec, evaluate_run
     from plushsense.workflow.preparation import prepare
     from plushsense.workflow.reporting import PAGE, load_evaluation, write_report
 
@@ -405,7 +401,7 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
         loss = {"train_loss": row.get("train_loss")}
         reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **loss, **clock.at(at.share))
 
-    evaluate_run(made, out=out, int8=bool(spec.get("int8")), progress=fold, warn=reporter.warn)
+    evaluate_run(made, FoldsSpec(out, int8=bool(spec.get("int8"))), progress=fold, warn=reporter.warn)
     report = write_report(out / PAGE, dataset, [out])
     return {"out": str(out), "report": str(report), **_evaluation(load_evaluation(out))}
 

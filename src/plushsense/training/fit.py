@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 
@@ -36,9 +36,6 @@ from torch.nn import functional as F
 
 Weights = dict[str, NDArray[np.float32]]
 
-# Probability of a gesture from which an idle window is hard.
-_HARD = 0.3
-
 
 @dataclass(frozen=True)
 class FittedNetwork:
@@ -50,7 +47,7 @@ class FittedNetwork:
             while training), validation_loss and validation_accuracy (None without validation) over all windows,
             validation_accuracy_people (see `accuracy_over_people`), learning_rate.
         best_epoch: the epoch of ``weights``.
-        kept: weights after each epoch in ``keep``.
+        kept: weights after each epoch in `StoreSpec.keep`.
         state: state to continue the training from; None with early stopping.
     """
 
@@ -63,16 +60,31 @@ class FittedNetwork:
     state: FitState | None = None
 
 
+@dataclass(frozen=True)
+class StoreSpec:
+    """What of a training is stored, and the state that it continues from.
+
+    Attributes:
+        start: state to continue from, with the same windows and settings but more epochs; the result is bit for bit
+            that of an uninterrupted training.
+        keep: epochs after which a copy of the weights is stored. With a constant learning rate, these equal the weights
+            of trainings with fewer epochs.
+        save: called with the state every ``save_every_s`` seconds.
+    """
+
+    start: FitState | None = None
+    keep: Collection[int] = ()
+    save: Callable[[FitState], None] | None = None
+    save_every_s: float = 60.0
+
+
 def fit(
     train: WindowSet,
     validation: WindowSet | None,
     arch: Arch,
-    spec: TrainSpec | None = None,
+    spec: TrainSpec,
     progress: EpochProgress | None = None,
-    keep: Collection[int] = (),
-    start: FitState | None = None,
-    save: Callable[[FitState], None] | None = None,
-    save_every_s: float = 60.0,
+    store: StoreSpec | None = None,
     weights: NDArray[np.float64] | None = None,
 ) -> FittedNetwork:
     """Train a network; the same seed gives the same weights.
@@ -80,10 +92,6 @@ def fit(
     Args:
         train: windows to train on.
         validation: windows that decide when to stop; None or empty: train all epochs.
-        keep: epochs after which a copy of the weights is stored. With a constant learning rate, these equal the weights
-            of trainings with fewer epochs.
-        start: state to continue from, with the same windows and settings but more epochs; the result is bit for bit
-            that of an uninterrupted training. ``save`` is called with one every ``save_every_s`` seconds.
         weights: how often each window of ``train`` counts in an epoch, (N,). Whole numbers give the same network as
             windows that are repeated; of fractions, each epoch draws whether the window counts once more.
 
@@ -91,7 +99,7 @@ def fit(
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
     """
     began = saved = time.perf_counter()
-    spec = spec or TrainSpec()
+    store = store or StoreSpec()
     validation = validation if validation is not None and len(validation) else None
     _check(train, arch, "train on")
     _check(validation, arch, "validate on")
@@ -103,7 +111,7 @@ def fit(
     with torch.random.fork_rng(devices=[]), repeatable(allow_tf32=True), torch_threads(threads):
         channels = Channels(train.vectors, scaler, device, arch.vector is not None)
         most = len(train) if weights is None else int(np.ceil(weights.sum()))
-        training = _Training(arch, spec, channels, most, val_data is not None, start)
+        training = _Training(arch, spec, channels, most, val_data is not None, store.start)
         with closing(training.net):
             for epoch in range(len(training.history) + 1, spec.epochs + 1):
                 rate = spec.learning_rate_at(epoch)
@@ -113,14 +121,14 @@ def fit(
                 row["learning_rate"] = rate
                 _refuse_not_finite(row, spec)
                 training.history.append(row)
-                if epoch in keep:
+                if epoch in store.keep:
                     training.kept[epoch] = training.net.export_weights()
                 if progress is not None:
                     progress(epoch, spec.epochs, row)
                 if training.is_over(row):
                     break
-                if save is not None and time.perf_counter() - saved >= save_every_s:
-                    save(training.state())
+                if store.save is not None and time.perf_counter() - saved >= store.save_every_s:
+                    store.save(training.state())
                     saved = time.perf_counter()
             return training.finished(scaler, time.perf_counter() - began)
 
@@ -258,41 +266,6 @@ def predict(
     with repeatable(), torch_threads(1):
         reader = engine(arch, net, place, 1, 1)
         return np.asarray(F.softmax(reader.logits(x), dim=1).cpu().numpy())
-
-
-def with_hard_negatives(
-    train: WindowSet,
-    candidates: WindowSet,
-    idle: int,
-    reactions: Sequence[int],
-    arch: Arch,
-    spec: TrainSpec,
-    share: float,
-    progress: EpochProgress | None = None,
-) -> WindowSet:
-    """Return the training windows with hard negatives: idle windows that a first network takes for a gesture.
-
-    Most idle windows are easy, and evenly spaced ones hold few of those at which a network reports a gesture for no
-    reason. A network is trained on ``train`` and computes the candidates of class ``idle``, which must be of the
-    training people. Those in which the classes of ``reactions`` together have a probability of at least 0.3 are added,
-    the highest first.
-
-    Args:
-        candidates: windows of the same classes; those of other classes are ignored. Windows that are in ``train``
-            already may be among them, and then count twice.
-        reactions: indices of the classes that must not be reported for no reason.
-        share: largest number of added windows, as a share of ``train``.
-        progress: as for `fit`.
-    """
-    at = np.flatnonzero(candidates.y == idle)
-    most = int(share * len(train))
-    if not len(at) or not most:
-        return train
-    first = fit(train, None, arch, spec, progress)
-    shares = predict(arch, first.weights, first.scaler, candidates.take(at), spec.device)
-    gesture = shares[:, list(reactions)].sum(axis=1)
-    hardest = np.argsort(-gesture, kind="stable")[:most]
-    return train.joined(candidates.take(at[hardest[gesture[hardest] >= _HARD]]))
 
 
 def _measure(row: EpochRow, net: Engine, data: tuple[Windows, Tensor] | None, windows: WindowSet | None) -> None:

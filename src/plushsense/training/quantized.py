@@ -10,7 +10,6 @@ network, not the labels, so that a few epochs on the training windows do not ove
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,45 +20,33 @@ from plushsense.models.arch import NORM_EPSILON, Arch, reflected
 from plushsense.models.net import Net, VectorNet
 from plushsense.runtime.integer import deployable, rounded_weights
 from plushsense.training.engine import Adam, slices, torch_threads
+from plushsense.training.fit import FittedNetwork, Weights
 from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.windows.cut import WindowSet
-from plushsense.windows.features import Scaler
 
 import torch  # isort: skip - after models.net, which says how to install it
 from torch import Tensor
 from torch.nn import functional as F
 
-Weights = dict[str, NDArray[np.float32]]
 _READ = 256  # windows at a time, without gradients
 _SLOWER = 5  # divisor of the last learning rate of the training
-
-
-@dataclass(frozen=True)
-class FineTuned:
-    """The outcome of `fine_tune`: ``weights`` after the last epoch, and ``history``, one row an epoch.
-
-    A row holds epoch (from 1), train_loss (Kullback-Leibler divergence from the float network) and learning_rate.
-    """
-
-    weights: Weights
-    history: list[EpochRow]
 
 
 def fine_tune(
     train: WindowSet,
     arch: Arch,
-    weights: Weights,
-    scaler: Scaler,
+    fitted: FittedNetwork,
     calibration: Mapping[str, Any],
     spec: TrainSpec,
     epochs: int,
-    progress: EpochProgress | None = None,
-) -> FineTuned:
-    """Fine-tune trained weights for rounding with the value ranges of ``calibration``, which do not change.
+    progress: EpochProgress = lambda *_: None,
+) -> Weights:
+    """Fine-tune a network for rounding with the value ranges of ``calibration``, which do not change; return weights.
 
     Batch size, seed and threads are those of ``spec``; the learning rate falls linearly to 0 from a fifth of the last
     one in its schedule. Windows are not augmented: rotated ones exceed the ranges and would be clipped. Runs on the
-    CPU. The same seed gives the same weights.
+    CPU. The same seed gives the same weights. The loss of the rows for ``progress`` is the Kullback-Leibler divergence
+    from the float network.
 
     Raises:
         TrainingError: for a network that cannot be deployed, without calibration, or for less than 1 epoch.
@@ -71,9 +58,9 @@ def fine_tune(
         )
     if epochs < 1:
         raise TrainingError(f"{epochs} epochs of fine-tuning: accepted are 1 and more.")
-    x = torch.from_numpy(scaler.apply(train.integers[:, :, train.integers.shape[2] - arch.span :]))
+    weights = fitted.weights
+    x = torch.from_numpy(fitted.scaler.apply(train.integers[:, :, train.integers.shape[2] - arch.span :]))
     highest = spec.learning_rate_at(spec.epochs) / _SLOWER
-    history: list[EpochRow] = []
     with torch.random.fork_rng(devices=[]), torch_threads(spec.threads):
         teacher = Net(arch)
         teacher.import_weights(weights)
@@ -93,10 +80,9 @@ def fine_tune(
                 torch.autograd.backward(loss)
                 adam.step(rate)
                 total += float(loss.detach()) * len(batch)
-            history.append({"epoch": epoch, "train_loss": total / len(x), "learning_rate": rate})
-            if progress is not None:
-                progress(epoch, epochs, {**history[-1], "what": "fine-tuning for 8 bits", "validation_accuracy": None})
-    return FineTuned(network.export_weights(), history)
+            row: EpochRow = {"epoch": epoch, "train_loss": total / len(x), "learning_rate": rate}
+            progress(epoch, epochs, {**row, "what": "fine-tuning for 8 bits", "validation_accuracy": None})
+    return network.export_weights()
 
 
 class Rounded:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from plushsense.core.errors import TrainingError
-from plushsense.training.augment import Channels, Transform, augmentations
+from plushsense.training.augment import Channels, augmentations
 from plushsense.training.engine import Adam, slices, torch_threads
 from plushsense.training.fit import resolve_device
 from plushsense.training.spec import TrainSpec
@@ -114,37 +114,22 @@ def fit_recurrent(
         augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
         adam = Adam(net.parameters(), fused=True if device.type == "cuda" else None)
         for epoch in range(1, spec.epochs + 1):
-            _epoch(net, adam, spec.learning_rate_at(epoch), x, y, spec.batch, order, augment, epoch)
+            shuffled, total = torch.randperm(len(x), generator=order).to(device), torch.zeros((), device=device)
+            for at in slices(len(x), spec.batch):
+                batch = shuffled[at]
+                if at.start and len(batch) < min(_FEW, spec.batch):
+                    continue
+                windows = x[batch] if augment is None else augment(x[batch], order)
+                loss = F.cross_entropy(net(windows), y[batch])
+                adam.zero_grad()
+                torch.autograd.backward(loss)
+                # Gradients of an LSTM can explode; without clipping, a single window could ruin the weights.
+                nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+                adam.step(spec.learning_rate_at(epoch))
+                total += loss.detach()
+            if not torch.isfinite(total):
+                raise TrainingError(
+                    f"The training loss of the recurrent network is no longer a number in epoch {epoch}: try a lower "
+                    "learning rate."
+                )
     return RecurrentReader(net.eval(), scaler, samples, time.perf_counter() - began)
-
-
-def _epoch(
-    net: Recurrent,
-    adam: Adam,
-    rate: float,
-    x: Tensor,
-    y: Tensor,
-    size: int,
-    order: torch.Generator,
-    augment: Transform | None,
-    epoch: int,
-) -> None:
-    shuffled = torch.randperm(len(x), generator=order).to(x.device)
-    total = torch.zeros((), device=x.device)
-    for start in range(0, len(x), size):
-        batch = shuffled[start : start + size]
-        if start and len(batch) < min(_FEW, size):
-            continue
-        windows = x[batch] if augment is None else augment(x[batch], order)
-        loss = F.cross_entropy(net(windows), y[batch])
-        adam.zero_grad()
-        torch.autograd.backward(loss)
-        # Gradients of an LSTM can explode; without clipping, a single window could ruin the weights.
-        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        adam.step(rate)
-        total += loss.detach()
-    if not torch.isfinite(total):
-        raise TrainingError(
-            f"The training loss of the recurrent network is no longer a number in epoch {epoch}: try a lower "
-            "learning rate."
-        )

@@ -14,9 +14,6 @@ replace this guess: positions in a practised gesture, and up to ``settle_s`` aft
 or where the toy is picked up, turned or put down are idle however much it moves. Of the remaining idle positions,
 evenly spaced ones are taken, so that ``idle_share`` of all windows are idle.
 
-With a ``hard_share``, `plushsense.training.fit.with_hard_negatives` adds hard negatives: those of all remaining idle
-positions that a first network takes for a gesture, at most this share of the windows.
-
 A recording that is in no stream (or has no position there) is cut as in `plushsense.windows.cut`, and marked. If a
 recording of a session has no place in the stream, the session gives no idle positions outside recordings, since its
 stream may contain that gesture.
@@ -65,8 +62,6 @@ class AnywhereSpec:
         idle_share: share of idle windows among all windows (0 to below 1).
         busy_share: share of the positions outside recordings, those with the most movement, that is left out because
             people may practise there (0 to 1).
-        hard_share: idle windows that a first network takes for a gesture are added, at most this share of the windows;
-            0: none is, and no first network is trained. ``evaluate`` accepts only 0 (0 to 1).
     """
 
     every_s: float = 0.4
@@ -75,7 +70,6 @@ class AnywhereSpec:
     settle_s: float = 1.0
     idle_share: float = 0.3
     busy_share: float = 0.3
-    hard_share: float = 0.0
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -109,11 +103,6 @@ def add_idle_gesture(gestures: GestureSet, dataset: Dataset) -> GestureSet:
             "set  idle = true  in its gesture set, or rename it."
         )
     return GestureSet(gestures.name, (*gestures.gestures, idle), gestures.inferred)
-
-
-def idle_candidates(spec: AnywhereSpec) -> AnywhereSpec:
-    """Return the settings with which `cut_anywhere` also returns (nearly) all idle positions that may be used."""
-    return replace(spec, idle_share=0.95)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,20 +33,20 @@ from plushsense.deploy.quantize import (
     quantize,
     refuse_undeployable,
 )
-from plushsense.evaluation.crossval import EvaluationResult, FoldOutput
+from plushsense.evaluation.crossval import CrossvalSpec, EvaluationResult, FoldOutput
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.leakage import warn_of_copies
 from plushsense.evaluation.scores import FoldRecord, PartResult, Predictions, Scores, gather_predictions, with_accuracy
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
+from plushsense.jobs.pool import JobsSpec
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle, is_training_content, known_people
-from plushsense.models.reference import softmax
+from plushsense.models.bundle import Bundle, is_training_content
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
-from plushsense.windows.cut import ANYWHERE, WindowSet, whole_gestures
+from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.networks import KEPT_S, REFIT, NetworkTrainer, TrainedNetwork
 from plushsense.workflow.preparation import (
@@ -56,15 +56,15 @@ from plushsense.workflow.preparation import (
     Warn,
     prepare,
     prepare_training,
-    refuse_hard_negatives,
     warn_of_files_twice,
     warn_of_single_people,
-    windows_for,
 )
 from plushsense.workflow.reporting import check_place, journal_of, save_evaluation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from plushsense.recording.simulate import SimulationResult
 
 
 # Number of windows that are predicted at once.
@@ -214,49 +214,49 @@ def train(
     those of whole gestures with the real signal before them.
 
     Args:
-        config: settings; alternatively give them by name (see `from_settings`): ``arch``, ``filters``,
-            ``preset="loso"``, ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
+        config: settings; alternatively give them by name (see `from_settings`), as in ``preset="loso", epochs=20``.
         quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`).
-        fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`). Settings in
-            ``config.live`` that differ from the defaults are kept.
+        fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`), but for those
+            in ``config.live`` that differ from the defaults.
         journal: stores the progress of the training (see `unfinished`), so that an interrupted one resumes and gives
             the same bundle. The steps after the training are repeated.
-        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
-            Rows of the first network that finds hard negatives (``hard_share`` of the context "anywhere"), of the
-            fine-tuning and of the training on everybody have ``what`` (see `workflow.networks`). The others have
-            ``accuracy``, that of validation as ``scores`` counts it.
-        warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions;
-            by default, they are Python warnings (`PlushSenseWarning`).
+        progress: called with (epoch, maximum of epochs, row), first for the epochs before an interruption. Rows of the
+            fine-tuning and of the training on everybody have ``what``, and others the ``accuracy`` of validation.
+        warn: called with a sentence for everything unusual; by default, these are Python warnings.
     """
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
-    made = prepare_training(dataset, config or from_settings(**settings), warn, deployable=quantize_aware > 0)
-    run, scored, division, dataset = made.run, made.scored, made.division, made.run.dataset
-    trainer = NetworkTrainer(
-        run, made.windows, division.kind == WHOLE_PEOPLE, quantize_aware, journal,
-        _reporting(progress, division.split.separates_people),
-    )  # fmt: skip
-    checked = trainer.train(division.train, scored.take(division.validation), division.fold.subjects)
-    nothing, everything = scored.take(division.validation[:0]), np.arange(len(made.windows))
-    final = trainer.train(everything, nothing, what=REFIT) if division.refit else checked
+    made = prepare_training(dataset, from_settings(config, **settings), warn, deployable=quantize_aware > 0)
+    run, scored, dataset, apart = made.run, made.scored, made.run.dataset, made.split.separates_people
+
+    def report(epoch: int, epochs: int, row: EpochRow) -> None:
+        if progress is not None:
+            progress(epoch, epochs, with_accuracy([row], apart)[0])
+
+    trainer = NetworkTrainer(run, made.windows, made.kind == WHOLE_PEOPLE, quantize_aware, journal, report)
+    checked = trainer.train(made.train, scored.take(made.validation), made.fold.subjects)
+    nothing, everything = scored.take(made.validation[:0]), np.arange(len(made.windows))
+    final = trainer.train(everything, nothing, what=REFIT) if made.refit else checked
     predictions, scores = _validated(made, checked, warn)
     bundle = _bundle(made, final, scores, quantize_aware)
     if fit_decisions:
         reader = replace(bundle, weights=checked.weights, scaler=checked.fitted.scaler)
         bundle = replace(bundle, decision=_decisions(reader, dataset, run.live, warn))
-    if division.refit:
-        _keep_predictions(bundle, dataset, predictions)
+    if made.kind == WHOLE_PEOPLE:
+        kept = journal_of(dataset, _PREDICTIONS)
+        kept.prune(KEPT_S)
+        keep_if_possible(kept, _predictions_id(bundle), {**vars(predictions)})
     trainer.discard()
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
-    history = with_accuracy(checked.fitted.history, division.split.separates_people)
-    seconds = checked.seconds + (final.seconds if division.refit else 0.0)
+    history = with_accuracy(checked.fitted.history, apart)
+    seconds = checked.seconds + (final.seconds if made.refit else 0.0)
     return Trained(bundle, history, scores, seconds, dataset.generation)
 
 
 def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScores, quantize_aware: int) -> Bundle:
     """Return the bundle of a trained network, with the decision settings that were given."""
-    run, division = made.run, made.division
+    run = made.run
     anywhere = {"anywhere": asdict(run.anywhere)} if run.windows.context == ANYWHERE else {}
     return Bundle(
         arch=run.network,
@@ -271,9 +271,9 @@ def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScore
             "dataset_hash": run.dataset.hash,
             "simulated": run.dataset.head.simulated,
             "subjects": sorted({str(s) for s in made.windows.subject[final.at]}),
-            "validation_subjects": sorted({str(s) for s in made.scored.subject[division.validation]}),
-            "split": division.kind,
-            "refit": division.refit,
+            "validation_subjects": sorted({str(s) for s in made.scored.subject[made.validation]}),
+            "split": made.kind,
+            "refit": made.refit,
             "context": dict(sorted(Counter(made.windows.context.tolist()).items())),
             "preset": run.preset,
             "training": run.training.to_dict(),
@@ -292,14 +292,14 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
     """
     from plushsense.training.fit import predict
 
-    run, division, fitted = made.run, made.division, trained.fitted
-    test = made.scored.take(division.fold.test)
-    sizes = (len(trained.at), len(division.validation), len(test))
-    record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
+    run, fold, fitted = made.run, made.fold, trained.fitted
+    test = made.scored.take(fold.test)
+    sizes = (len(trained.at), len(made.validation), len(test))
+    record = FoldRecord(fold.name, fold.subjects, sizes, len(fitted.history), fitted.seconds)
 
     def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, Scores]:
-        predictions = gather_predictions(made.scored, [(division.fold.name, division.fold.test)], [probabilities])
-        apart = division.split.separates_people
+        predictions = gather_predictions(made.scored, [(fold.name, fold.test)], [probabilities])
+        apart = made.split.separates_people
         return predictions, score_predictions(predictions, [record], made.scored.affects, apart)
 
     predictions, found = score(predict(run.network, trained.weights, fitted.scaler, test, run.training.device))
@@ -320,9 +320,9 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
                 )
             )
     return predictions, TrainingScores(
-        split=division.kind,
-        leaky=division.split.leaky,
-        description=division.description,
+        split=made.kind,
+        leaky=made.split.leaky,
+        description=made.description,
         windows=len(test),
         accuracy=found.mean("accuracy"),
         macro_f1=found.mean("macro_f1"),
@@ -331,16 +331,6 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
         simulated=run.dataset.head.simulated,
         int8=int8,
     )
-
-
-def _reporting(progress: EpochProgress | None, apart: bool) -> EpochProgress:
-    """Return a callback for the epochs of a training, which adds ``accuracy`` to their rows."""
-
-    def report(epoch: int, epochs: int, row: EpochRow) -> None:
-        if progress is not None:
-            progress(epoch, epochs, with_accuracy([row], apart)[0])
-
-    return report
 
 
 def _decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> dict[str, Any]:
@@ -364,71 +354,61 @@ def _predictions_id(bundle: Bundle) -> str:
     return job_id({"what": _PREDICTIONS, "dataset": bundle.provenance["dataset_hash"], "weights": weights})
 
 
-def _keep_predictions(bundle: Bundle, dataset: Dataset, predictions: Predictions) -> None:
-    """Store what the network that did not know the validation people answered, for `validation_predictions`."""
-    journal = journal_of(dataset, _PREDICTIONS)
-    journal.prune(KEPT_S)
-    keep_if_possible(journal, _predictions_id(bundle), {**vars(predictions)})
+@dataclass(frozen=True)
+class FoldsSpec:
+    """What `evaluate_run` trains, where, and where it writes the result.
+
+    Attributes:
+        out: a folder for ``evaluation.json`` and ``predictions.parquet``. A folder with an evaluation of other settings
+            or data is refused unless ``overwrite``.
+        cluster: address of a Ray cluster that trains the folds.
+        int8: also score each fold's network in 8 bits on the same windows, as ``int8`` of the result. Folds that were
+            stored without it are trained again.
+        people: train each fold on so many of its people only, for a learning curve; not with ``out``.
+    """
+
+    out: str | os.PathLike[str] | None = None
+    overwrite: bool = False
+    cluster: str | None = None
+    int8: bool = False
+    people: int | None = None
 
 
 def evaluate(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
     *,
-    split: str | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
-    cluster: str | None = None,
     int8: bool = False,
-    training_people: int | None = None,
     progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = python_warning,
     **settings: Any,
 ) -> EvaluationResult:
-    """Train and score one network for each fold of ``split``.
+    """Train and score one network for each fold of a split.
 
     Finished folds are stored in the data set's ``cache`` folder, so that an interrupted evaluation can be resumed.
 
     Args:
-        config, settings, warn: as for `train`; also ``train_context`` and ``workers``.
-        split: "leave-one-subject-out" (default), "by-subject:5", "by-recording:5", "windows:5" (leaky).
-        out: a folder for ``evaluation.json`` and ``predictions.parquet``. A folder with an evaluation of other settings
-            or data is refused unless ``overwrite``.
-        cluster: address of a Ray cluster that trains the folds.
-        int8: also score each fold's network in 8 bits on the same windows, as ``int8`` of the result. Folds that were
-            stored without it are trained again.
-        training_people: train each fold on so many of its people only, for a learning curve; not with ``out``.
+        config, settings, warn: as for `train`; also ``train_context``, ``workers``, and ``split``:
+            "leave-one-subject-out" (default), "by-subject:5", "by-recording:5", "windows:5" (leaky).
+        out, overwrite, int8: as in `FoldsSpec`.
     """
-    given = config or from_settings(**settings)
-    run = prepare(dataset, given if split is None else given.for_split(split), warn)
-    return evaluate_run(
-        run,
-        out=out,
-        overwrite=overwrite,
-        cluster=cluster,
-        int8=int8,
-        training_people=training_people,
-        progress=progress,
-        warn=warn,
-    )
+    run = prepare(dataset, from_settings(config, **settings), warn)
+    return evaluate_run(run, FoldsSpec(out, overwrite, int8=int8), progress=progress, warn=warn)
 
 
 def evaluate_run(
     run: Run,
+    spec: FoldsSpec,
     *,
-    out: str | os.PathLike[str] | None = None,
-    overwrite: bool = False,
-    cluster: str | None = None,
-    int8: bool = False,
-    training_people: int | None = None,
     progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = python_warning,
 ) -> EvaluationResult:
-    """Train and score one network for each fold of a prepared run; the arguments are those of `evaluate`."""
-    refuse_hard_negatives(run)
-    if out is not None:
-        check_place(Path(out), run, replace=overwrite)
-    if int8:
+    """Train and score one network for each fold of a prepared run."""
+    if spec.out is not None:
+        check_place(Path(spec.out), run, replace=spec.overwrite)
+    if spec.int8:
         refuse_undeployable(run.network)
     warn_of_files_twice(run.dataset, run.gestures, warn)
     score = fit_on = run.scored_windows(warn)
@@ -438,66 +418,52 @@ def evaluate_run(
         fit_on = run.training_windows()
     from plushsense.training.fit import resolve_device
 
+    key = {
+        "arch": run.network.to_dict(),
+        "training": resolve_device(run.training).key(),
+        "vectors": fit_on.vectors,
+        **({"int8": QUANTIZE_VERSION} if spec.int8 else {}),
+        **({"people": spec.people} if spec.people is not None else {}),
+    }
+    jobs = JobsSpec(run.evaluation.processes, journal=journal_of(run.dataset, "folds"), cluster=spec.cluster)
     result = crossvalidate(
         fit_on,
         score,
         run.split,
-        TrainAndPredict(run.network, run.training, int8, training_people),
-        journal=journal_of(run.dataset, "folds"),
-        key={
-            "arch": run.network.to_dict(),
-            "training": resolve_device(run.training).key(),
-            "vectors": fit_on.vectors,
-            **({"int8": QUANTIZE_VERSION} if int8 else {}),
-            **({"people": training_people} if training_people is not None else {}),
-        },
-        workers=run.evaluation.processes,
-        cluster=cluster,
-        seed=run.evaluation.seed,
-        validation=run.holds_back,
+        TrainAndPredict(run.network, run.training, spec.int8, spec.people),
+        CrossvalSpec(run.evaluation.seed, run.holds_back, jobs, key),
         shared_rows=partial(copied_recordings, run.dataset, score.recording_ids),
         progress=progress,
     )
     warn_of_copies(result.leakage, warn)
-    if out is not None:
+    if spec.out is not None:
         with run.dataset.generation.writing():
-            save_evaluation(result, run, Path(out))
+            save_evaluation(result, run, Path(spec.out))
     return result
 
 
 def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[str]) -> Predictions:
     """Return what a network answered on the recordings of its validation people, as `train` scored it.
 
-    If the network in the bundle was then trained on everybody (``refit``), these are the stored answers of the one
-    before, which are kept for 30 days; otherwise they are computed. Recordings at rest are left out.
+    The answers are kept for 30 days; those of a network that was then trained on everybody (``refit``) are of the one
+    before. Recordings at rest are left out.
 
     Raises:
-        DatasetError: if the bundle has no validation people or their answers are gone, the data set was changed since
-            the training (reason ``data_changed``), or has none of their recordings.
+        DatasetError: if the bundle has no validation people or their answers are gone, or the data set was changed
+            since the training.
     """
     dataset = as_dataset(dataset)
-    people = known_people(bundle.provenance, ["validation_subjects"])
-    stored = journal_of(dataset, _PREDICTIONS).find(_predictions_id(bundle)) if bundle.provenance.get("refit") else None
-    lost = bundle.provenance.get("refit") and stored is None
-    if bundle.provenance.get("split") != WHOLE_PEOPLE or not people or lost:
+    stored = journal_of(dataset, _PREDICTIONS).find(_predictions_id(bundle))
+    if bundle.provenance.get("split") != WHOLE_PEOPLE or stored is None:
         raise DatasetError("This network has no validation people: evaluate it instead.")
     if not is_training_content(bundle, dataset):
         raise DatasetError(
             "The data set '{name}' was changed since this network was trained: evaluate it instead.",
             name=dataset.head.name,
         )
-    if stored is not None:
-        known = ~np.isin(stored["subject"], [NOBODY, UNKNOWN_SUBJECT])
-        arrays = {key: value[known] for key, value in stored.items() if key != "labels"}
-        return Predictions(labels=tuple(stored["labels"]), **arrays)
-    dataset = dataset.with_inputs(bundle.layout).with_gestures(bundle.gestures)
-    # All recordings are cut, because how long a gesture usually is depends on them.
-    every = windows_for(dataset, bundle.arch, whole_gestures(bundle.windowing), bundle.gestures)
-    windows = every.take(np.flatnonzero(np.isin(every.subject, list(people))))
-    network = bundle.network()
-    parts = [windows.integers[at : at + _BATCH] for at in range(0, len(windows), _BATCH)]
-    logits = np.concatenate([network.forward(bundle.scaler.apply(part)) for part in parts])
-    return gather_predictions(windows, [("validation", np.arange(len(windows)))], [softmax(logits).astype(np.float32)])
+    known = ~np.isin(stored["subject"], [NOBODY, UNKNOWN_SUBJECT])
+    arrays = {key: value[known] for key, value in stored.items() if key != "labels"}
+    return Predictions(labels=tuple(stored["labels"]), **arrays)
 
 
 def load(path: str | os.PathLike[str]) -> Bundle:
@@ -512,8 +478,8 @@ def simulate(
     repetitions: int = 3,
     seed: int = 1,
     dataset: str | os.PathLike[str] | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
-) -> dict[str, Any]:
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> SimulationResult:
     """Write recordings of virtual people in the format of the paper's recorder, by default as many as the authors have.
 
     Args:
@@ -524,17 +490,14 @@ def simulate(
     from plushsense.recording.simulate import SimulationSpec
     from plushsense.recording.simulate import simulate as run
 
-    report = progress or (lambda *_: None)
     done = run(
         Path(out),
         SimulationSpec(people=people, repetitions=repetitions, seed=seed),
-        progress=lambda at, total, _: report("recording", at, total),
+        progress=lambda at, total, _: progress("recording", at, total),
     )
-    summary: dict[str, Any] = asdict(done)
     if dataset is not None:
-        import_simulation(out, dataset, report)
-        summary["dataset"] = str(dataset)
-    return summary
+        import_simulation(out, dataset, progress)
+    return done
 
 
 def import_simulation(

@@ -13,6 +13,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,26 +24,17 @@ from plushsense.core.errors import PlushSenseError, python_warning
 from plushsense.core.files import free_path, write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.scores import Scores
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
 from plushsense.scoring.metrics import summary
 from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
-from plushsense.workflow.api import evaluate_run, train, unfinished
+from plushsense.workflow.api import FoldsSpec, evaluate_run, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.networks import REFIT
-from plushsense.workflow.preparation import (
-    Run,
-    Warn,
-    count_people,
-    prepare,
-    refits,
-    refuse_hard_negatives,
-    silent,
-)
+from plushsense.workflow.preparation import Run, Warn, count_people, prepare, refits, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, journal_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -69,7 +61,7 @@ class TrainingCost:
         windows: number of windows of all people.
         side_by_side: number of folds that are trained at the same time.
         networks: number of trainings that the final network takes: 2 if people are first held out for its decision
-            settings, else 1; twice as many if another network finds hard negatives for each.
+            settings, else 1.
     """
 
     window_epoch_s: float
@@ -280,13 +272,10 @@ class _Making:
         self._began = time.monotonic()
         self._dataset, self._out, self._config = dataset, out, config
         self._budget_s, self._progress, self._warn = budget_s, progress, warn
-        run = prepare(dataset, config)
-        refuse_hard_negatives(run)
         self._again = refits(config, count_people(dataset))
-        self._networks = 1 + self._again
         # A resumed run must not choose other folds because the computer is faster or slower than before.
         self._journal = journal_of(dataset, "budgets")
-        self._key = job_id({"evaluation": run.id, "out": out.name, "seconds": budget_s})
+        self._key = job_id({"evaluation": prepare(dataset, config).id, "out": out.name, "seconds": budget_s})
 
     @property
     def _seconds(self) -> float:
@@ -298,7 +287,7 @@ class _Making:
             plan, bundle = self._begin()
         else:
             plan = BudgetPlan(**{**stored["plan"], "sizes": tuple(stored["plan"]["sizes"])})
-            bundle = _saved_bundle(self._out.parent, stored["bundle"]) or self._train(plan)[0]
+            bundle = _saved_bundle(self._out.parent / stored["bundle"]) or self._train(plan)[0]
             self._store(plan, bundle.name)
         run = prepare(self._dataset, _planned(self._config, plan), self._warn)
         folder = self._dataset.path / "evaluations" / run.name
@@ -314,7 +303,7 @@ class _Making:
     def _begin(self) -> tuple[BudgetPlan, Path]:
         """Plan and train; return the plan, which the measured time may have changed, and the path of the network."""
         seconds = _USED * self._budget_s
-        cost = _measured(self._dataset, self._config, self._networks)
+        cost = _measured(self._dataset, self._config, 1 + self._again)
         plan = choose_plan(cost, count_people(self._dataset), self._config.training.epochs, seconds)
         if cost.side_by_side * cost.evaluation_s(plan.epochs, plan.folds) < _START_S:
             plan = replace(plan, workers=1)
@@ -327,16 +316,21 @@ class _Making:
     def _store(self, plan: BudgetPlan, bundle: str) -> None:
         self._journal.save(self._key, {"plan": asdict(plan), "bundle": bundle})
 
+    def _whole(self, plan: BudgetPlan) -> float:
+        """Return the whole work, in trainings on all people."""
+        evaluations = 1.0 + sum(size / plan.trained_people for size in plan.sizes)
+        return 1.0 + self._again + (plan.folds - 1) * evaluations
+
     def _train(self, plan: BudgetPlan) -> tuple[Path, float]:
         """Train the network and save it; return its path, and the seconds that one training on everybody took."""
-        whole, again, progress = sum(_work(plan, self._networks)), self._again, self._progress
+        whole, again, progress = self._whole(plan), self._again, self._progress
 
         def epoch_done(epoch: int, epochs: int, row: EpochRow) -> None:
             second = str(row.get("what", "")).startswith(REFIT)
-            done = epoch / epochs + second
-            progress(BudgetProgress(TRAINING, done / whole, {**row, "epoch": epoch, "epochs": epochs}))
+            share = (epoch / epochs + second) / whole
+            progress(BudgetProgress(TRAINING, share, {**row, "epoch": epoch, "epochs": epochs}))
             if epoch == epochs and second == again:
-                progress(BudgetProgress(DECIDING, done / whole, {}))
+                progress(BudgetProgress(DECIDING, share, {}))
 
         config, dataset = _planned(self._config, plan), self._dataset
         done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=self._warn)
@@ -344,9 +338,9 @@ class _Making:
 
     def _evaluate(self, plan: BudgetPlan, run: Run, out: Path, bundle: Path, resumed: bool) -> LearningCurve | None:
         """Evaluate on all people, then on fewer while the time allows."""
-        before, whole = float(self._networks), sum(_work(plan, self._networks))
+        before, whole = 1.0 + self._again, self._whole(plan)
 
-        def reported(stage: str, share: float) -> Callable[[JobProgress], None]:
+        def evaluated(stage: str, share: float, spec: FoldsSpec) -> dict[str, float | None]:
             base = before
 
             def fold_done(at: JobProgress) -> None:
@@ -354,20 +348,18 @@ class _Making:
                 row = {"done": at.done, "folds": at.total}
                 self._progress(BudgetProgress(stage, done / whole, row, str(bundle)))
 
-            return fold_done
+            scores = evaluate_run(run, spec, progress=fold_done, warn=self._warn if spec.people is None else silent)
+            return {row.subject: row.metrics["accuracy"] for row in scores.scores.subjects}
 
         started = time.monotonic()
-        result = evaluate_run(run, out=out, progress=reported(EVALUATING, 1.0), warn=self._warn)
+        points = {plan.trained_people: evaluated(EVALUATING, 1.0, FoldsSpec(out))}
         evaluation_s = time.monotonic() - started
         before += plan.folds - 1
-        points = {plan.trained_people: _accuracies(result.scores)}
         for size in plan.sizes:
             share = size / plan.trained_people
             if not resumed and share * evaluation_s > self._budget_s - self._seconds:
                 break
-            progress = reported(LEARNING_CURVE, share)
-            smaller = evaluate_run(run, training_people=size, progress=progress, warn=silent)
-            points[size] = _accuracies(smaller.scores)
+            points[size] = evaluated(LEARNING_CURVE, share, FoldsSpec(people=size))
             before += (plan.folds - 1) * share
         return learning_curve(points)
 
@@ -400,23 +392,12 @@ def _adjusted(plan: BudgetPlan, cost: TrainingCost, training_s: float, left_s: f
     return replace(other, epochs=plan.epochs, usual_epochs=plan.usual_epochs, workers=plan.workers)
 
 
-def _saved_bundle(folder: Path, name: str) -> Path | None:
+def _saved_bundle(path: Path) -> Path | None:
     """Return the path of the network that an interrupted run has saved; None if there is none."""
-    try:
-        Bundle.load(folder / name)
-    except PlushSenseError:
-        return None
-    return folder / name
-
-
-def _work(plan: BudgetPlan, networks: int) -> list[float]:
-    """Return the work of each step, in trainings on all people."""
-    evaluation = float(plan.folds - 1)
-    return [float(networks), evaluation, *(evaluation * size / plan.trained_people for size in plan.sizes)]
-
-
-def _accuracies(scores: Scores) -> dict[str, float | None]:
-    return {row.subject: row.metrics["accuracy"] for row in scores.subjects}
+    with suppress(PlushSenseError):
+        Bundle.load(path)
+        return path
+    return None
 
 
 def _cut(plan: BudgetPlan, learning: object, seconds: float, budget_s: float) -> tuple[Mapping[str, Any], ...]:

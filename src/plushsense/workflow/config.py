@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -112,10 +112,6 @@ class RunConfig:
     anywhere: AnywhereSpec = field(default_factory=AnywhereSpec)
     augment_given: bool = False
 
-    def for_split(self, split: str) -> RunConfig:
-        """Return the settings with another split."""
-        return replace(self, evaluation=replace(self.evaluation, split=split))
-
 
 @dataclass(frozen=True)
 class _TrainingTable(TrainSpec):
@@ -194,18 +190,23 @@ _SETTINGS: dict[str, tuple[str, ...]] = {
         *("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device"),
         *("augment", "turn_deg", "scaling", "weight_decay"),
     ),
-    "evaluation": ("classes", "train_context", "workers"),
+    "evaluation": ("split", "classes", "train_context", "workers"),
     "live": ("smoothing_s",),
-    "anywhere": ("every_s", "onset_s", "after_s", "settle_s", "idle_share", "busy_share", "hard_share"),
+    "anywhere": ("every_s", "onset_s", "after_s", "settle_s", "idle_share", "busy_share"),
 }
 
 
-def from_settings(**settings: Any) -> RunConfig:
-    """Build a configuration from settings: ``arch="14d1_39d2_41d4", preset="loso"``; None counts as not given.
+def from_settings(config: RunConfig | None = None, /, **settings: Any) -> RunConfig:
+    """Return ``config``, or build one from settings: ``arch="14d1_39d2_41d4", preset="loso"``; None: not given.
 
     Raises:
-        ConfigError: for an unknown setting (the message suggests the nearest known one) or an invalid value.
+        ConfigError: for an unknown setting (the message suggests the nearest known one) or an invalid value, and for
+            settings beside a ``config``.
     """
+    if config is not None:
+        if settings:
+            raise ConfigError(f"Both a config and settings ({', '.join(settings)}) are given: give one of them.")
+        return config
     known = [key for keys in _SETTINGS.values() for key in keys] + ["seed"]
     for key in settings:
         check_known(key, known, "setting", ConfigError)

@@ -105,43 +105,53 @@ def check_dataset(
     return CheckResult(**{f.name: getattr(checked, f.name) for f in fields(CheckReport)})
 
 
-def decide(
-    dataset: Dataset | str | os.PathLike[str],
-    *,
-    accept: Sequence[str] = (),
-    unaccept: Sequence[str] = (),
-    exclude: Sequence[str] = (),
-    include: Sequence[str] = (),
-    why: str = "",
-    who: str | None = None,
-    only: Iterable[str] = (),
-    limits: CheckLimits | Mapping[str, float] | None = None,
-    progress: Progress | None = None,
-) -> tuple[CheckResult, int]:
-    """Mark decisions, then check the data set; return the result and the number of added marks.
+@dataclass(frozen=True)
+class DecisionSpec:
+    """Decisions about findings and recordings.
 
-    Args:
+    Attributes:
         accept, unaccept: ``CHECK:PATTERN``, e.g. ``gaps:P26/*``; ``CHECK`` alone means the data set as a whole.
         exclude, include: patterns of recordings, e.g. ``P19/*``.
         why: the reason, required to accept or exclude.
         who: the person who decides; default: the login name.
-        only, limits, progress: as for `check_dataset`.
+    """
+
+    accept: Sequence[str] = ()
+    unaccept: Sequence[str] = ()
+    exclude: Sequence[str] = ()
+    include: Sequence[str] = ()
+    why: str = ""
+    who: str | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self.accept or self.unaccept or self.exclude or self.include)
+
+
+def decide(
+    dataset: Dataset | str | os.PathLike[str],
+    spec: DecisionSpec,
+    *,
+    only: Iterable[str] = (),
+    limits: CheckLimits | Mapping[str, float] | None = None,
+    progress: Progress | None = None,
+) -> tuple[CheckResult, int]:
+    """Mark decisions, then check the data set as `check_dataset` does; return the result and the number of new marks.
 
     Raises:
         ConfigError: without a reason, or for an unknown check.
         DatasetError: for a pattern that matches nothing.
     """
-    if (accept or exclude) and not why.strip():
+    if (spec.accept or spec.exclude) and not spec.why.strip():
         raise ConfigError('Accepting and excluding need a reason: give it with --why "…".')
     dataset = as_dataset(dataset)
-    name = checking.author_name(who) if accept or unaccept or exclude or include else ""
+    by = {"who": checking.author_name(spec.who) if spec else "", "why": spec.why}
     # Resolve all patterns before marking anything, so that a wrong one does not leave a partial decision.
-    marks = checking.exclusions(dataset, exclude, include, who=name, why=why)
-    marks += checking.withdrawals(dataset, unaccept, who=name, why=why)
-    for acceptance in accept:
+    marks = checking.exclusions(dataset, spec.exclude, spec.include, **by)
+    marks += checking.withdrawals(dataset, spec.unaccept, **by)
+    for acceptance in spec.accept:
         checking.parse_acceptance(acceptance)
-    if accept:
-        marks += checking.acceptances(check_dataset(dataset, limits=limits), accept, who=name, why=why)
+    if spec.accept:
+        marks += checking.acceptances(check_dataset(dataset, limits=limits), spec.accept, **by)
     marked = dataset.append_marks(marks)
     if marked:
         dataset = as_dataset(dataset.path)

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.index import open_dataset
@@ -14,7 +14,8 @@ from plushsense.dataset.store import Dataset
 from plushsense.deploy.code import FACTS
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import VirtualDevice
-from plushsense.live.loop import run_live
+from plushsense.evaluation.crossval import EvaluationResult
+from plushsense.live.loop import LiveSummary, run_live
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import StreamClassifier
 from plushsense.workflow.api import evaluate, import_simulation, simulate, train
@@ -48,12 +49,45 @@ Stage = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
 
 
-def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress) -> dict[str, Any]:
-    """Run the demo in the folder ``out``; a second run reuses the finished recordings and folds.
+class DemoGesture(NamedTuple):
+    """A gesture that the virtual toy performed, from ``t_s``, and the decision at its end."""
 
-    Returns:
-        the paths ``dataset``, ``bundle``, ``report`` and ``export``, the ``scores``, and the ``live`` decisions.
-    """
+    t_s: float
+    performed: str
+    affect: str
+    decided: str
+    decided_affect: str | None
+    confidence: float | None
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What `run_demo` made, how good the network is on people left out, and what it decided live."""
+
+    dataset: Path
+    bundle: Path
+    report: Path
+    export: Path
+    evaluation: EvaluationResult
+    live: LiveSummary
+    gestures: tuple[DemoGesture, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON; the decisions have the keys ``said`` and ``said_affect``."""
+        scores = self.evaluation.to_json()
+        keys = ("split", "context", "leaky", "accuracy", "macro_f1", "by_recording")
+        names = {"decided": "said", "decided_affect": "said_affect"}
+        gestures = [{names.get(key, key): value for key, value in g._asdict().items()} for g in self.gestures]
+        return {
+            "simulation": SIMULATION,
+            **{name: str(getattr(self, name)) for name in ("dataset", "bundle", "report", "export")},
+            "scores": {key: scores[key] for key in keys},
+            "live": {"summary": self.live.to_dict(), "gestures": gestures},
+        }
+
+
+def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress) -> DemoResult:
+    """Run the demo in the folder ``out``; a second run reuses the finished recordings and folds."""
     size = QUICK if quick else FULL
     out.mkdir(parents=True, exist_ok=True)
     mark = out / MARK
@@ -63,7 +97,8 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
     name = f"{size.people}x{size.repetitions}"
     stage(f"1/6  {size.people} virtual people record {size.repetitions} × 17 gestures, and the recordings are imported")
     dataset = _dataset(out / f"dataset-{name}", out / f"recordings-{name}", size, progress)
-    config = resolve(None, training={"epochs": size.epochs, "halve_every": max(1, size.epochs // 4)})
+    training = {"epochs": size.epochs, "halve_every": max(1, size.epochs // 4)}
+    config = resolve(None, training=training, evaluation={"split": f"by-subject:{size.folds}"})
     arch = prepare(dataset, config).model.arch
     stage(f"2/6  train {arch} on {len(dataset.subjects)} people, some of them for validation")
     trained = train(dataset, config, progress=lambda epoch, epochs, _: progress("training", epoch, epochs), warn=silent)
@@ -73,27 +108,21 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
     result = evaluate(
         dataset,
         config,
-        split=f"by-subject:{size.folds}",
         out=evaluation,
         overwrite=True,
         progress=lambda at: progress("folds", at.done, at.total),
         warn=silent,
-    ).to_json()
+    )
     stage(f"4/6  live: {size.live_s:.0f} s of a virtual person left out of the training")
-    live = _live(bundle, size.live_s)
+    live, gestures = _live(bundle, size.live_s)
     stage("5/6  export C for the toy, which gives the same answers")
-    exported = _export(bundle, out / "export")
+    exported = out / "export"
+    if (exported / FACTS).is_file():  # that of an earlier demo
+        shutil.rmtree(exported)
+    exported = export(bundle, exported, warn=silent).folder
     stage("6/6  write the report")
     report = write_report(out / "report.html", dataset, [evaluation], [bundle], title="PlushSense demo")
-    return {
-        "simulation": SIMULATION,
-        "dataset": str(dataset.path),
-        "bundle": str(bundle),
-        "report": str(report),
-        "export": str(exported),
-        "scores": {key: result[key] for key in ("split", "context", "leaky", "accuracy", "macro_f1", "by_recording")},
-        "live": live,
-    }
+    return DemoResult(dataset.path, bundle, report, exported, result, live, gestures)
 
 
 def _dataset(dest: Path, raw: Path, size: DemoSize, progress: Progress) -> Dataset:
@@ -105,37 +134,20 @@ def _dataset(dest: Path, raw: Path, size: DemoSize, progress: Progress) -> Datas
     return import_simulation(raw, dest, progress)
 
 
-def _export(bundle: Path, folder: Path) -> Path:
-    """Export the model, replacing the export of an earlier demo."""
-    if (folder / FACTS).is_file():
-        shutil.rmtree(folder)
-    return export(bundle, folder, warn=silent).folder
-
-
-def _live(bundle: Path, seconds: float) -> dict[str, Any]:
+def _live(bundle: Path, seconds: float) -> tuple[LiveSummary, tuple[DemoGesture, ...]]:
     """Compare the decision at the end of each gesture of a virtual person with the performed gesture."""
     model = Bundle.load(bundle)
-    classifier = StreamClassifier(model)
     with open_device(f"virtual://?person={STRANGER}&seed=7&speed=0", model.layout) as device:
         if not isinstance(device, VirtualDevice):
             raise ConfigError("The demo needs the virtual toy.")
-        live = run_live(device, classifier, seconds=seconds)
+        live = run_live(device, StreamClassifier(model), seconds=seconds)
         decisions = list(live)
-        summary = live.summary().to_dict()
-        gestures = []
+        summary, gestures = live.summary(), []
         for performed in device.performed:
             begin, end = performed.start_s, performed.end_s
             during = [d for d in decisions if begin <= d.t_s <= end and d.gesture is not None]
-            if during and end <= summary["seconds"]:
-                last = during[-1]
-                gestures.append(
-                    {
-                        "t_s": round(begin, 2),
-                        "performed": performed.label,
-                        "affect": model.gestures.get(performed.label).affect,
-                        "said": last.gesture,
-                        "said_affect": last.affect,
-                        "confidence": last.confidence,
-                    }
-                )
-    return {"summary": summary, "gestures": gestures}
+            if during and end <= summary.seconds:
+                last, affect = during[-1], model.gestures.get(performed.label).affect
+                answer = (str(last.gesture), last.affect, last.confidence)
+                gestures.append(DemoGesture(round(begin, 2), performed.label, affect, *answer))
+    return summary, tuple(gestures)

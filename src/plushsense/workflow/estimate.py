@@ -21,7 +21,7 @@ from plushsense.models.arch import Arch
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig
-from plushsense.workflow.preparation import Run, Warn, prepare, prepare_training, refuse_hard_negatives, silent
+from plushsense.workflow.preparation import Run, Warn, prepare, prepare_training, silent
 
 # Passes of a training step: forward, and backward to the weights and to the previous layer.
 PASSES = 3
@@ -64,9 +64,8 @@ def preview_training(
 ) -> CostEstimate:
     """Return what `api.train` would train on and its cost."""
     made = prepare_training(dataset, config, warn)
-    run, windows, division = made.run, made.windows, made.division
-    trained = len(division.train) + (len(windows) if division.refit else 0)
-    return _estimate(run, windows, trained, (division.kind, division.split.leaky, run.windows.context, 1))
+    trained = len(made.train) + (len(made.windows) if made.refit else 0)
+    return _estimate(made.run, made.windows, trained, (made.kind, made.split.leaky, made.run.windows.context, 1))
 
 
 def preview_evaluation(
@@ -74,7 +73,6 @@ def preview_evaluation(
 ) -> CostEstimate:
     """Return what `api.evaluate` would train on and its cost, without the training itself."""
     run = prepare(dataset, config, warn)
-    refuse_hard_negatives(run)
     score = fit_on = run.scored_windows(warn)
     if run.trained_on != run.scored_on:
         fit_on = run.training_windows()

@@ -24,7 +24,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE
-from plushsense.training.spec import PADDING, EpochRow, TrainSpec, preset
+from plushsense.training.spec import PADDING, EpochRow, preset
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import InputUnits
 
@@ -51,51 +51,29 @@ _TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
 
 
 def rows_of(X: Any) -> tuple[Any, tuple[int, int] | None]:
-    """Return windows (N, C, T) as rows (N, C·T), which scikit-learn can check, and (C, T); other input and None."""
-    X = stacked(X)
+    """Return windows (N, C, T) as rows (N, C·T), which scikit-learn can check, and (C, T); other input and None.
+
+    Raises:
+        ArrayError: for windows of different shapes, or more than three axes.
+    """
+    nested = np.asarray(X) if hasattr(X, "dtypes") else X  # a table of pandas, perhaps with a series in each cell
+    if isinstance(nested, np.ndarray) and nested.dtype.kind == "O" and nested.size and _is_sequence(nested.flat[0]):
+        nested = nested.tolist()
+    if isinstance(nested, list | tuple) and nested and _is_sequence(nested[0]):
+        try:
+            X = np.asarray([np.asarray(window) for window in nested])
+        except ValueError:
+            raise ArrayError(
+                "X has windows, or channels of a window, of different lengths, and the network reads one: cut "
+                "recordings into windows (ps.cut_windows does it for a data set), or all to the shortest, as in "
+                "np.stack([w[:, :n] for w in X])."
+            ) from None
     shape = X.shape if hasattr(X, "shape") else np.asarray(X).shape
     if len(shape) < 3:
         return X, None
     if len(shape) > 3:
         raise ArrayError(f"X has the shape {shape}: expected (N, C, T), or (N, C·T) with channels=C.")
     return np.reshape(np.asarray(X), (shape[0], shape[1] * shape[2])), (shape[1], shape[2])
-
-
-def stacked(X: Any) -> Any:
-    """Return windows that are a list or an array of arrays as one array; other input unchanged.
-
-    Raises:
-        ArrayError: for windows of different shapes.
-    """
-    nested = X
-    if hasattr(X, "dtypes"):  # a table of pandas, perhaps with a series in each cell
-        nested = np.asarray(X)
-    if not isinstance(nested, list | tuple) and getattr(getattr(nested, "dtype", None), "kind", "") != "O":
-        return X
-    if isinstance(nested, np.ndarray) and nested.ndim == 2 and nested.size and _is_sequence(nested[0, 0]):
-        nested = [list(row) for row in nested]
-    if not len(nested) or not _is_sequence(nested[0]):
-        return X
-    try:
-        windows = [np.array([np.asarray(part) for part in w]) if isinstance(w, list) else np.asarray(w) for w in nested]
-    except ValueError:
-        raise ArrayError(
-            "X has a window whose channels have different lengths: give each the same number of samples."
-        ) from None
-    shapes = sorted({window.shape for window in windows})
-    if len(shapes) == 1:
-        return np.stack(windows)
-    other = [axis for axis, sizes in enumerate(zip(*shapes, strict=False)) if len(set(sizes)) > 1]
-    if len(other) != 1 or len({len(shape) for shape in shapes}) > 1:
-        raise ArrayError(f"X has windows of different shapes ({shapes[0]}, {shapes[-1]}): expected is (C, T) for all.")
-    axis = other[0]
-    least, most = shapes[0][axis], shapes[-1][axis]
-    cut = f"[{', '.join([':'] * axis + [f':{least}'])}]"
-    raise ArrayError(
-        f"X has windows of different lengths, from {least} to {most} samples: the network reads one length. "
-        f"Cut recordings into windows (ps.cut_windows does it for a data set), or all to the shortest, as in "
-        f"np.stack([w{cut} for w in X])."
-    )
 
 
 def _is_sequence(value: Any) -> bool:
@@ -110,46 +88,20 @@ def shape_of(features: int, shape: tuple[int, int] | None, given: int | None) ->
     """
     if given is not None and (not isinstance(given, int | np.integer) or given < 1):
         raise ArrayError(f"channels is {given!r}: accepted are None and whole numbers from 1 up.")
-    if shape is not None and (shape[0] > shape[1] if given is None else shape[0] != given == shape[1]):
-        unless = "" if given is not None else f", or channels={shape[0]} if it does have so many"
+    if shape is not None and (shape[0] > shape[1] if given is None else shape[0] != given):
+        unless = f", or channels={shape[0]} if it does have so many" if given is None else ""
+        expected = "fewer channels than samples" if given is None else f"{given} channels, as channels or layout say"
         raise ArrayError(
-            f"X has windows of {shape[0]} channels of {shape[1]} samples, which seem to be {shape[1]} channels of "
-            f"{shape[0]} samples: expected is (N, C, T), so give np.swapaxes(X, 1, 2){unless}."
-        )
-    if shape is not None and given is not None and shape[0] != given:
-        raise ArrayError(
-            f"X has windows of {shape[0]} channels, but channels or layout say {given}: change one of them."
+            f"X has windows of {shape[0]} channels of {shape[1]} samples; expected is (N, C, T) with {expected}. If X "
+            f"is (N, T, C), give np.swapaxes(X, 1, 2){unless}."
         )
     channels = shape[0] if shape is not None else int(given or 1)
-    if features % channels:
-        raise ArrayError(f"X has n_features = {features}, which {channels} channels do not divide: give (N, C·T).")
-    if features // channels < 2:
+    if features % channels or features // channels < 2:
         raise ArrayError(
-            f"X has n_features = {features} in {channels} channels: a window needs at least 2 samples of each."
+            f"X has n_features = {features}, and {channels} channels: expected is (N, C·T) with at least 2 samples of "
+            "each channel."
         )
     return channels, features // channels
-
-
-def people_of(groups: ArrayLike | None, n: int) -> NDArray[np.str_]:
-    """Return the person of each window, (N,); without ``groups`` each window counts as another person."""
-    people = np.arange(n) if groups is None else np.asarray(groups)
-    if people.shape != (n,):
-        raise ArrayError(f"groups has the shape {people.shape}: expected ({n},), one a window.")
-    return people.astype(str)
-
-
-def weights_of(sample_weight: ArrayLike | None, n: int) -> NDArray[np.float64]:
-    """Return the weight of each of ``n`` windows, (n,); without ``sample_weight`` 1."""
-    if sample_weight is None:
-        return np.ones(n)
-    weights = np.asarray(sample_weight, dtype=np.float64)
-    if weights.shape != (n,):
-        raise ArrayError(f"sample_weight has the shape {weights.shape}: expected ({n},), one a window.")
-    if not (np.isfinite(weights).all() and (weights >= 0.0).all()):
-        raise ArrayError("sample_weight has values that are negative or no numbers: give weights from 0 up.")
-    if not weights.any():
-        raise ArrayError("sample_weight has only zeros: at least two windows need a weight.")
-    return weights
 
 
 def balanced_by_class(
@@ -174,15 +126,6 @@ def in_own_order(x: NDArray[Any], *others: NDArray[Any]) -> NDArray[np.int64]:
     """Return an order of windows (N, C, T) and their ``others`` (N,) that does not depend on the order they are in."""
     keys = [blake2b(window.tobytes(), digest_size=16).digest() for window in x]
     return np.array(sorted(range(len(x)), key=lambda i: (*(o[i] for o in others), keys[i])), dtype=np.int64)
-
-
-def validation_mask(people: NDArray[np.str_], seed: int) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the windows of the people held out for early stopping; all False if there is one person."""
-    names = np.unique(people)
-    if len(names) < 2:
-        return np.zeros(len(people), dtype=bool)
-    held = np.random.default_rng(seed).permutation(names)[: max(1, round(VALIDATION_SHARE * len(names)))]
-    return np.isin(people, held)
 
 
 def anonymous_layout(x: NDArray[Any]) -> Layout:
@@ -301,12 +244,12 @@ def gestures_of(classes: NDArray[Any], known: GestureSet | None = None) -> Gestu
     return GestureSet(known.name if known is not None else ANONYMOUS, gestures, inferred=known is None)
 
 
-def labels_table(classes: NDArray[Any]) -> dict[str, Any]:
+def _labels_table(classes: NDArray[Any]) -> dict[str, Any]:
     """Return the labels of ``classes`` in the form that a bundle stores and `labels_from` restores."""
     values = classes.tolist()
-    if not all(isinstance(v, str | int | float) for v in values):
-        return {"labels": [str(v) for v in values], "dtype": "O"}
-    return {"labels": values, "dtype": "O" if classes.dtype.kind == "O" else classes.dtype.str}
+    plain = all(isinstance(v, str | int | float) for v in values)
+    dtype = classes.dtype.str if plain and classes.dtype.kind != "O" else "O"
+    return {"labels": values if plain else [str(v) for v in values], "dtype": dtype}
 
 
 def labels_from(bundle: Bundle) -> NDArray[Any]:
@@ -326,6 +269,9 @@ def labels_from(bundle: Bundle) -> NDArray[Any]:
     except (KeyError, TypeError, ValueError, OverflowError) as cause:
         raise BundleError(f"The bundle's class labels cannot be read ({cause}): train again.") from None
 
+
+if TYPE_CHECKING:
+    from plushsense.training.fit import FittedNetwork
 
 if TYPE_CHECKING or importlib.util.find_spec("sklearn") is None:
     # PlushClassifier must be importable without scikit-learn (`from plushsense import *`); constructing one then raises
@@ -447,48 +393,81 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
 
         layout = self._known_layout()
         x, labels = self._windows(X, y, layout)
-        people, weights = people_of(groups, len(x)), weights_of(sample_weight, len(x))
-        some = weights > 0.0
-        x, labels, people, weights = x[some], labels[some], people[some], weights[some]
-        weights = balanced_by_class(weights, labels, self.class_weight)
+        x, labels, people, weights = self._weighted(x, labels, groups, sample_weight)
         classes, index = np.unique(labels, return_inverse=True)
         if len(classes) < 2:
-            raise ArrayError(f"y has only one class ({classes[0]!s}): a classifier needs at least two.")
+            listed = ", ".join(map(str, classes))
+            raise ArrayError(f"y has {len(classes)} class with a weight ({listed}): a classifier needs at least two.")
         numbers = {name: _python_number(getattr(self, name)) for name in ("epochs", "batch", "learning_rate")}
         spec = preset(self.preset, **numbers, seed=_seed(self.random_state))
         layout = layout or anonymous_layout(x)
-        gestures = gestures_of(classes)
         arch = self._network(x.shape[1], len(classes), x.shape[2], layout.rate_hz)
         x = to_integers(x, layout)
-        named = groups is not None
-        order = in_own_order(x, index, *([people] if named else []))
-        x, index, weights = x[order], index[order], weights[order]
-        people = people[order] if named else people_of(None, len(x))
-        windows = windows_of(x, index.astype(np.int64), people, layout, gestures)
-        held_back = validation_mask(people, spec.seed) if spec.patience is not None else np.zeros(len(x), dtype=bool)
+        order = in_own_order(x, index, *([people] if groups is not None else []))
+        x, index, weights = x[order], index[order].astype(np.int64), weights[order]
+        people = people[order] if groups is not None else np.arange(len(x)).astype(str)
+        windows = windows_of(x, index, people, layout, gestures_of(classes))
+        held_back = np.zeros(len(x), dtype=bool)
+        if spec.patience is not None and len(names := np.unique(people)) > 1:
+            drawn = np.random.default_rng(spec.seed).permutation(names)
+            held_back = np.isin(people, drawn[: max(1, round(VALIDATION_SHARE * len(names)))])
         trained = weights[~held_back]
         scaling = np.clip(trained.mean(), 1.0, _MOST_REPEATS) / trained.mean()
         fitted = fit(
             windows.take(np.flatnonzero(~held_back)),
-            windows.take(np.flatnonzero(held_back)) if held_back.any() else None,
+            windows.take(np.flatnonzero(held_back)),
             arch,
             spec,
             weights=None if (trained == 1.0).all() else trained * scaling,
         )
-        codes = [sorted(set(people[part].tolist())) if named else [] for part in (~held_back, held_back)]
         self.classes_, self.history_ = classes, fitted.history
-        self.bundle_ = Bundle(
+        parts = () if groups is None else (~held_back, held_back)
+        people_of = [sorted(set(people[part].tolist())) for part in parts]
+        origin: dict[str, Any] = {
+            "dataset": "arrays given to PlushClassifier",
+            "estimator": {"settings": self._settings(), **_labels_table(classes)},
+            "windows": len(x),
+            "weighted": bool((trained != 1.0).any()),
+            "subjects": people_of[0] if people_of else [],
+            "validation_subjects": people_of[1] if people_of else [],
+            "split": "none",
+            "preset": self.preset,
+            "training": spec.to_dict(),
+            "code_version": __version__,
+        }
+        self.bundle_ = self._bundle(arch, fitted, windows.take(np.flatnonzero(~held_back)), layout, origin)
+        return self
+
+    def _bundle(
+        self, arch: Arch, fitted: FittedNetwork, trained: WindowSet, layout: Layout, origin: dict[str, Any]
+    ) -> Bundle:
+        return Bundle(
             arch=arch,
             weights=fitted.weights,
             layout=layout,
             scaler=fitted.scaler,
-            gestures=gestures,
-            windowing={"window_s": x.shape[2] / layout.rate_hz, "context": "unknown"},
+            gestures=gestures_of(self.classes_),
+            windowing={"window_s": trained.integers.shape[2] / layout.rate_hz, "context": "unknown"},
             decision=DecideSpec().to_dict(),
-            provenance=self._provenance(spec, len(x), bool((trained != 1.0).any()), codes),
-            calibration=calibration(arch, fitted.weights, fitted.scaler, windows.integers[~held_back]),
+            provenance=origin,
+            calibration=calibration(arch, fitted.weights, fitted.scaler, trained.integers),
         )
-        return self
+
+    def _weighted(
+        self, x: NDArray[Any], labels: NDArray[Any], groups: ArrayLike | None, sample_weight: ArrayLike | None
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.str_], NDArray[np.float64]]:
+        """Return windows, labels, people and weights of the windows with a weight above 0."""
+        from sklearn.utils.validation import _check_sample_weight
+
+        rows = x.reshape(len(x), -1)
+        weights = _check_sample_weight(sample_weight, rows, dtype=np.float64, ensure_non_negative=True)
+        # Without groups, each window counts as another person.
+        people = np.asarray(np.arange(len(x)) if groups is None else groups)
+        if people.shape != (len(x),):
+            raise ArrayError(f"groups has the shape {people.shape}: expected ({len(x)},), one a window.")
+        some = weights > 0.0
+        weights = balanced_by_class(weights[some], labels[some], self.class_weight)
+        return x[some], labels[some], people[some].astype(str), weights
 
     def _windows(self, X: ArrayLike, y: ArrayLike, layout: Layout | None) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return windows (N, C, T) and labels (N,) that scikit-learn has checked."""
@@ -506,20 +485,6 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         refuse_holes(x)
         check_classification_targets(labels)
         return x, labels
-
-    def _provenance(self, spec: TrainSpec, windows: int, weighted: bool, codes: Sequence[list[str]]) -> dict[str, Any]:
-        return {
-            "dataset": "arrays given to PlushClassifier",
-            "estimator": {"settings": self._settings(), **labels_table(self.classes_)},
-            "windows": windows,
-            "weighted": weighted,
-            "subjects": codes[0],
-            "validation_subjects": codes[1],
-            "split": "none",
-            "preset": self.preset,
-            "training": spec.to_dict(),
-            "code_version": __version__,
-        }
 
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
         """Return logits (N, K) in the order of ``classes_``; for two classes the second minus the first, (N,)."""
@@ -587,12 +552,17 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
     def _network(self, channels: int, classes: int, samples: int, rate_hz: float) -> Arch:
         """Return the network for windows of (C, T); raise ArrayError if they are too short for it."""
         padding = PADDING[self.preset] if self.padding is None else self.padding
-        default = symbol_at_rate(DEFAULT_SYMBOL, rate_hz)
-        symbol = default if self.arch is None else self.arch
-        shortened = self.arch is None and symbol_within(default, samples) != default
-        if shortened:
-            symbol = symbol_within(default, max(samples // 2, min(samples, _SHORTEST_FIELD)))
-        made = Arch.parse(
+        symbol = symbol_at_rate(DEFAULT_SYMBOL, rate_hz) if self.arch is None else self.arch
+        if self.arch is None and (shorter := symbol_within(symbol, samples)) != symbol:
+            shorter = symbol_within(symbol, max(samples // 2, min(samples, _SHORTEST_FIELD)))
+            shorter = Arch.parse(shorter, self.filters).symbol
+            warnings.warn(
+                f"X has windows of {samples} samples, fewer than the default network {symbol} reads: it is shortened "
+                f"to {shorter}. With arch='{shorter}' there is no warning.",
+                stacklevel=3,
+            )
+            symbol = shorter
+        arch = Arch.parse(
             symbol,
             self.filters,
             channels=channels,
@@ -602,23 +572,16 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             window=samples,
             step=1,
         )
-        if shortened:
-            warnings.warn(
-                f"X has windows of {samples} samples, fewer than the default network {default} reads: it is shortened "
-                f"to {made.symbol}. With arch='{made.symbol}' there is no warning.",
-                stacklevel=3,
-            )
-        if made.receptive_field > samples:
+        free = samples if padding != "stream" else samples - arch.receptive_field + 1
+        if arch.receptive_field > samples:
             problem = (
-                f"X has windows of {samples} samples, but {made.symbol} with padding '{padding}' needs at least "
-                f"{made.receptive_field}: give longer windows or a shorter network (arch=None makes one that fits)"
+                f"X has windows of {samples} samples, but {arch.symbol} with padding '{padding}' needs at least "
+                f"{arch.receptive_field}: give longer windows or a shorter network (arch=None makes one that fits)"
             )
             if padding == "stream":
                 raise ArrayError(f"{problem}, or padding='mirror'.")
             warnings.warn(f"{problem}.", stacklevel=3)
-        if padding != "stream":
-            return replace(made, step=min(5, samples))
-        return replace(made, step=min(5, samples - made.receptive_field + 1), pool=None)
+        return replace(arch, step=min(5, free), pool=None)
 
     def _settings(self) -> dict[str, Any]:
         """Return the training settings as a bundle stores them for `from_bundle`."""

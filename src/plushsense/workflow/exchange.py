@@ -1,4 +1,4 @@
-"""Convert windows and data sets for other libraries: PyTorch, aeon, sktime, pandas, Hugging Face, and readers of XDF.
+"""Convert windows and data sets for other libraries: PyTorch, aeon, sktime, Hugging Face, and readers of XDF.
 
 `import_recordings` reads the files that these functions write.
 """
@@ -40,27 +40,6 @@ def to_torch(windows: WindowSet) -> Any:
 def to_panel(windows: WindowSet) -> tuple[NDArray[np.float64], NDArray[np.str_]]:
     """Return windows (N, C, T), `WindowSet.x`, and labels (N,), as aeon and sktime (``numpy3D``) read them."""
     return windows.x.astype(np.float64), np.array(windows.labels)[windows.y]
-
-
-def to_pandas(windows: WindowSet) -> tuple[Any, Any]:
-    """Return a table of samples with a column for each channel, and one of windows with what is known of each.
-
-    The index of the samples is (window, sample), which is the format ``pd-multiindex`` of sktime; that of the windows
-    is the window. Columns of the windows: gesture, affect, subject, recording, context.
-    """
-    pandas = need("pandas", "tables")
-    n, channels, samples = windows.integers.shape
-    index = pandas.MultiIndex.from_product([range(n), range(samples)], names=["window", "sample"])
-    values = windows.x.transpose(0, 2, 1).reshape(n * samples, channels)
-    about = {
-        "gesture": np.array(windows.labels)[windows.y],
-        "affect": np.array(windows.affects)[windows.y],
-        "subject": windows.subject,
-        "recording": np.array(windows.recording_ids)[windows.recording],
-        "context": windows.context,
-    }
-    rows = pandas.RangeIndex(n, name="window")
-    return pandas.DataFrame(values, index, list(windows.inputs)), pandas.DataFrame(about, rows)
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,7 @@ def training_windows(
 ) -> NDArray[np.int32]:
     """Cut the integer windows (N, C, T) of the people on whom a bundle was trained, with the settings of the training.
 
-    Args:
-        dataset: the data set of the training; ``warn`` is called if its content has changed since then.
+    ``warn`` is called if the content of the data set has changed since then.
 
     Raises:
         ArchError: for a network that cannot be deployed.
@@ -84,8 +83,7 @@ def training_windows(
     if dataset.layout.inputs != bundle.layout.inputs or dataset.layout.period_us != bundle.layout.period_us:
         raise BundleError(
             "The data set '{name}' has the layout '{layout}', the bundle '{bundle_layout}': give the data set that "
-            "it was "
-            "trained on.",
+            "it was trained on.",
             name=dataset.head.name,
             layout=dataset.layout.name,
             bundle_layout=bundle.layout.name,
@@ -97,9 +95,10 @@ def training_windows(
                 name=dataset.head.name,
             )
         )
-    known = {field.name for field in fields(WindowSpec)}
-    spec = WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
-    anywhere = AnywhereSpec(**bundle.windowing.get("anywhere", {}))
+    # Keys of earlier versions are left out.
+    tables = (bundle.windowing, WindowSpec), (bundle.windowing.get("anywhere", {}), AnywhereSpec)
+    known = [{f.name: table[f.name] for f in fields(kind) if f.name in table} for table, kind in tables]
+    spec, anywhere = WindowSpec(**known[0]), AnywhereSpec(**known[1])
     windows = windows_for(dataset, bundle.arch, spec, bundle.gestures, warn, anywhere)
     at = np.flatnonzero(np.isin(windows.subject, sorted(people)))
     if not len(at):
@@ -115,15 +114,29 @@ def training_windows(
     return windows.integers[at]
 
 
+@dataclass(frozen=True)
+class PackageNames:
+    """What an export is called.
+
+    Attributes:
+        name: prefix of all names in the C code, its files and packages, so that several exports link into one program.
+        model_version: version of the model, for the manifests and the C code; by default that in the bundle, or that
+            of PlushSense.
+        url: web page of the model, for the manifests; by default an address that leads nowhere.
+    """
+
+    name: str = ""
+    model_version: str = ""
+    url: str = ""
+
+
 def export(
     bundle: Bundle | str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
     dataset: Dataset | str | os.PathLike[str] | None = None,
     also: Sequence[str] = (),
-    name: str = "",
-    model_version: str = "",
-    url: str = "",
+    package: PackageNames | None = None,
     warn: Warn = python_warning,
 ) -> ExportResult:
     """Write the files that a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
@@ -133,10 +146,7 @@ def export(
         out: a new or empty folder.
         dataset: the data set of the training, to calibrate on; required if the bundle has no calibration.
         also: formats for other runtimes (`plushsense.deploy.convert.CONVERTERS`), such as ``onnx``.
-        name: prefix of all names in the C code, its files and packages, so that several exports link into one program.
-        model_version: version of the model, for the manifests and the C code; by default that in the bundle, or that
-            of PlushSense.
-        url: web page of the model, for the manifests; by default an address that leads nowhere.
+        package: what the code and the packages are called.
         warn: called with a sentence for everything unusual.
 
     Raises:
@@ -146,7 +156,8 @@ def export(
             version or address that is not accepted.
         BadInput: for a folder that is not empty.
     """
-    check_names(name, url=url, model_version=model_version)
+    package = package or PackageNames()
+    check_names(package.name, url=package.url, model_version=package.model_version)
     for other in also:
         check_format(other)
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
@@ -158,9 +169,10 @@ def export(
             windows = training_windows(given, dataset, warn)
             windows = windows[:: -(-len(windows) // _TRIED)]
         given = calibrated_on(given, dataset, warn if windows is None else silent)
-    if model_version:
-        given = replace(given, provenance=given.provenance | {"model_version": model_version})
-    return emit(integer_model(given), given, Path(out), name=name, url=url, also=also, windows=windows)
+    if package.model_version:
+        given = replace(given, provenance=given.provenance | {"model_version": package.model_version})
+    names = {"name": package.name, "url": package.url}
+    return emit(integer_model(given), given, Path(out), **names, also=also, windows=windows)
 
 
 @dataclass(frozen=True)
@@ -171,7 +183,7 @@ class SavedWindows:
     bytes: int
     windows: dict[str, int]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the object that ``plushsense evaluate --save-windows --json`` prints."""
         return {"file": str(self.path), "bytes": self.bytes, "windows": self.windows}
 
@@ -181,7 +193,6 @@ def save_windows(
     path: str | os.PathLike[str],
     config: RunConfig | None = None,
     *,
-    split: str | None = None,
     overwrite: bool = False,
     warn: Warn = python_warning,
     **settings: Any,
@@ -193,8 +204,7 @@ def save_windows(
     them ``trainrecordings`` and so on (ids, which begin with the person), and ``simulated``.
 
     Args:
-        config, settings: as for `api.evaluate`.
-        split: a split with one fold, such as "windows:file-order" or "recordings:holdout".
+        config, settings: as for `api.evaluate`; the split must have one fold, as "windows:file-order" has.
         overwrite: replace an existing file.
 
     Raises:
@@ -203,12 +213,11 @@ def save_windows(
         MissingExtraError: if SciPy is not installed.
     """
     path = Path(path)
-    given = config or from_settings(**settings)
     if path.suffix != ".mat":
         raise ConfigError(f"'{path}' is no name of a MATLAB file: give one that ends in .mat.")
     if path.exists() and not overwrite:
         raise ConfigError(f"'{path}' exists already: give the name of a new file, or replace it with --force.")
-    run = prepare(dataset, given if split is None else given.for_split(split), warn)
+    run = prepare(dataset, from_settings(config, **settings), warn)
     windows = run.scored_windows(warn)
     folds = fold_windows(windows, windows, run.split, run.evaluation.seed)
     if len(folds) > 1:
@@ -245,7 +254,7 @@ class PatchResult:
     bytes: int
     image_check: int
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the object that ``plushsense export --patch-for --json`` prints."""
         return {"patch": str(self.path), "bytes": self.bytes, "image_check": self.image_check}
 

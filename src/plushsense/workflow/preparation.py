@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.layouts import Layout
 from plushsense.core.sentences import Message
@@ -31,10 +31,11 @@ from plushsense.models.arch import (
     symbol_at_rate,
     symbol_within,
 )
+from plushsense.reports.table import text
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
-from plushsense.training.spec import PADDING, PRESETS, VECTOR_AUGMENT, EpochProgress, TrainSpec
-from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere, idle_candidates
+from plushsense.training.spec import PADDING, PRESETS, VECTOR_AUGMENT, TrainSpec
+from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
 from plushsense.windows.cut import (
     ANYWHERE,
     ROWS,
@@ -106,7 +107,7 @@ class Run:
         """Cut the windows to score (see `windows_for`)."""
         return windows_for(self.dataset, self.network, self.scored_on, self.gestures, warn)
 
-    def settings(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return all settings as plain values for JSON."""
         names = ("windows", "model", "training", "evaluation", "live", "anywhere")
         tables = {name: asdict(getattr(self, name)) for name in names}
@@ -125,8 +126,9 @@ class Run:
             "evaluation": evaluation,
         }
 
-    def changes(self) -> dict[str, Any]:
-        """Return the settings of windows, network and training that differ from the preset's for this network.
+    @property
+    def changes(self) -> str:
+        """The settings of windows, network and training that differ from the preset's for this network, as a text.
 
         The symbol of the network, its filters and padding, the context and the seed are left out.
         """
@@ -137,12 +139,12 @@ class Run:
         }
         own = self.outcome()
         apart = ("arch", "filters", "padding", "seed", "context")
-        return {
-            key: value
+        return ", ".join(
+            f"{key} {text(value)}"
             for table, values in usual.items()
             for key, value in own[table].items()
             if value != values.get(key) and key not in apart
-        }
+        )
 
     @property
     def id(self) -> str:
@@ -325,50 +327,6 @@ def warn_of_far_readings(windows: WindowSet, warn: Warn) -> None:
         )
 
 
-def add_hard_negatives(
-    train: WindowSet,
-    dataset: Dataset,
-    arch: Arch,
-    spec: WindowSpec,
-    anywhere: AnywhereSpec | None,
-    gestures: GestureSet,
-    training: TrainSpec,
-    others: Collection[str],
-    progress: EpochProgress | None = None,
-) -> WindowSet:
-    """Return training windows of the context "anywhere" with hard negatives.
-
-    `plushsense.training.fit.with_hard_negatives` explains them. The windows are returned unchanged with another
-    context, without an idle gesture, or with a ``hard_share`` of 0.
-
-    Args:
-        spec, anywhere: the settings with which ``train`` was cut.
-        others: people who must not be used, such as those of validation and test.
-        progress: as for `plushsense.training.fit.fit`, for the training of the first network.
-    """
-    anywhere = anywhere or AnywhereSpec()
-    idle = [k for k, gesture in enumerate(gestures.gestures) if gesture.idle]
-    if spec.context != ANYWHERE or not idle or not anywhere.hard_share:
-        return train
-    from plushsense.training.fit import with_hard_negatives
-
-    cut = windows_for(dataset, arch, spec, gestures, anywhere=idle_candidates(anywhere))
-    mine = np.isin(cut.subject, np.unique(train.subject)) & outside_streams(cut, dataset, others)
-    candidates = cut.take(np.flatnonzero(mine))
-    # A toy that is held between gestures may report a neutral one: that is no reaction, and often not wrong.
-    reactions = [k for k, g in enumerate(gestures.gestures) if not g.idle and g.affect != "neutral"]
-    return with_hard_negatives(train, candidates, idle[0], reactions, arch, training, anywhere.hard_share, progress)
-
-
-def refuse_hard_negatives(run: Run) -> None:
-    """Raise ConfigError for settings with which `train` would add hard negatives, and an evaluation would not."""
-    if run.trained_on.context == ANYWHERE and run.anywhere.hard_share:
-        raise ConfigError(
-            f"hard_share is {run.anywhere.hard_share:g}, but an evaluation trains without hard negatives: set it to "
-            "0, or score networks with them on whole streams with  plushsense stream-eval --split."
-        )
-
-
 def warn_of_untrimmed(dataset: Dataset, gestures: GestureSet, warn: Warn) -> None:
     """Warn if most recordings of gestures in streams begin where they were started, not where the gesture begins."""
     active = [g.label for g in gestures.gestures if not g.idle]
@@ -473,23 +431,6 @@ WHOLE_PEOPLE = "validation-subjects"
 _FEWEST_APART = 3  # people; with fewer, recordings are held out for validation
 
 
-@dataclass(frozen=True)
-class TrainValidationSplit:
-    """The train/validation split of a single training; ``train`` and ``validation`` are indices of the windows of each.
-
-    ``refit``: whether a second network, which is the one to keep, is trained on everybody in the same way after the
-    first was scored.
-    """
-
-    split: Split
-    kind: str
-    description: str
-    fold: Fold
-    train: NDArray[np.int64]
-    validation: NDArray[np.int64]
-    refit: bool
-
-
 def count_people(dataset: Dataset) -> int:
     """Return the number of people with a recording that is not excluded."""
     return len({r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT})
@@ -503,54 +444,38 @@ def refits(config: RunConfig | Run, people: int) -> bool:
     return people >= _FEWEST_APART and config.training.patience is None and config.preset != "search"
 
 
-def split_validation(windows: WindowSet, run: Run, scored: WindowSet | None = None) -> TrainValidationSplit:
-    """Hold out people for validation; with fewer than three, recordings; with the preset ``search``, windows.
-
-    Where the validation windows do not determine when to stop, ``refit`` asks for a second training on everybody.
-
-    ``validation`` and the fold's ``test`` are indices into ``scored``, windows of the same recordings that may be cut
-    with other settings (default: ``windows``). Except with ``search``, no scored recording is trained on.
-    """
-    scored = windows if scored is None else scored
-    seed = run.evaluation.seed
-    stops = "" if run.training.patience is None else " but decided when to stop"
-    if run.preset == "search":
-        split = parse_split("windows:holdout")
-        fold = fold_windows(windows, scored, split, seed)[0]
-        description = "15 % of the windows, drawn at random: leaky, windows of one recording are on both sides"
-        return TrainValidationSplit(split, split.text, description, fold, fold.train, fold.validation, False)
-    people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
-    if len(people) >= _FEWEST_APART:
-        split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
-        kind, description = WHOLE_PEOPLE, f"people who were not trained on{stops}: "
-        if refits(run, len(people)):
-            description = "people who were held back from the first of two trainings: "
-    else:
-        recordings = len(np.unique(windows.recording))
-        split = parse_split(f"by-recording:{max(2, min(recordings // 2, round(1 / VALIDATION_SHARE)))}")
-        kind = "validation-recordings"
-        description = f"recordings that were not trained on{stops}; of people who were, so the scores are too high"
-    fold = fold_windows(windows, scored, split, seed)[0]
-    if split.separates_people:
-        description += ", ".join(fold.subjects)
-    rest = np.sort(np.concatenate([fold.train, fold.validation]))
-    return TrainValidationSplit(split, kind, description, fold, rest, fold.test, refits(run, len(people)))
-
-
 @dataclass(frozen=True)
 class PreparedTraining:
-    """All that a single training starts from; ``scored`` are the windows of validation (see `split_validation`)."""
+    """All that a single training starts from: the run, the windows, and which of them are held out for validation.
+
+    Attributes:
+        windows: windows to train on, at the indices ``train``.
+        scored: windows of the same recordings, perhaps cut with other settings; those of validation are at the indices
+            ``validation``, and at ``fold.test`` those that the network is scored on.
+        kind: `WHOLE_PEOPLE`, "validation-recordings" or the name of the leaky split; ``description`` as a sentence.
+        refit: whether a second network, which is the one to keep, is trained on everybody in the same way after the
+            first was scored.
+    """
 
     run: Run
     windows: WindowSet
     scored: WindowSet
-    division: TrainValidationSplit
+    split: Split
+    kind: str
+    description: str
+    fold: Fold
+    train: NDArray[np.int64]
+    validation: NDArray[np.int64]
+    refit: bool
 
 
 def prepare_training(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, warn: Warn = silent, *, deployable: bool = False
 ) -> PreparedTraining:
     """Choose the gestures and the network, cut the windows and divide them; a ``train_context`` is ignored.
+
+    People are held out for validation; with fewer than three, recordings; with the preset ``search``, windows, which is
+    leaky. Otherwise no scored recording is trained on.
 
     Args:
         deployable: refuse a network that cannot run in 8 bits.
@@ -562,7 +487,27 @@ def prepare_training(
     windows = scored = run.training_windows(warn)
     if run.scored_on != run.trained_on:
         scored = run.scored_windows()
-    division = split_validation(windows, run, scored)
-    if run.windows.context == ANYWHERE and run.anywhere.hard_share and division.kind != WHOLE_PEOPLE:
-        warn("no hard negatives are added, as whole people must be held out for that: record three people or more")
-    return PreparedTraining(run, windows, scored, division)
+    people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
+    refit = refits(run, len(people))
+    stops = "" if run.training.patience is None else " but decided when to stop"
+    groups = round(1 / VALIDATION_SHARE)
+    if run.preset == "search":
+        split = parse_split("windows:holdout")
+        kind = split.text
+        description = "15 % of the windows, drawn at random: leaky, windows of one recording are on both sides"
+    elif len(people) >= _FEWEST_APART:
+        split = parse_split(f"by-subject:{min(len(people), groups)}")
+        kind, description = WHOLE_PEOPLE, f"people who were not trained on{stops}: "
+        if refit:
+            description = "people who were held back from the first of two trainings: "
+    else:
+        split = parse_split(f"by-recording:{max(2, min(len(np.unique(windows.recording)) // 2, groups))}")
+        kind = "validation-recordings"
+        description = f"recordings that were not trained on{stops}; of people who were, so the scores are too high"
+    fold = fold_windows(windows, scored, split, run.evaluation.seed)[0]
+    train, validation = fold.train, fold.validation
+    if run.preset != "search":
+        train, validation = np.sort(np.concatenate([train, validation])), fold.test
+    if split.separates_people:
+        description += ", ".join(fold.subjects)
+    return PreparedTraining(run, windows, scored, split, kind, description, fold, train, validation, refit)

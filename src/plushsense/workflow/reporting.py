@@ -20,7 +20,6 @@ from plushsense.evaluation.crossval import EvaluationResult
 from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.reports.table import text
 from plushsense.workflow.preparation import Run
 
 
@@ -142,7 +141,7 @@ def save_evaluation(result: EvaluationResult, run: Run, out: Path) -> Path:
         "title": evaluation_title(result, run),
         "model": card(run.network, rate_hz=run.dataset.layout.rate_hz),
         "dataset": run.dataset.summary(),
-        "config": run.settings(),
+        "config": run.to_json(),
         "code_version": __version__,
     }
     path = out / SCORES
@@ -155,11 +154,8 @@ def evaluation_title(result: EvaluationResult, run: Run) -> str:
     context = f"{result.context} context"
     if result.train_context != result.context:
         context += f", trained on {result.train_context}"
-    training = ", ".join(
-        [f"{run.preset} training, seed {run.training.seed}"]
-        + [f"{key} {text(value)}" for key, value in run.changes().items()]
-    )
-    return f"{run.network.title} {run.network.padding}, {result.split.text}, {context}, {training}"
+    parts = (f"{run.network.title} {run.network.padding}", result.split.text, context, f"{run.preset} training")
+    return ", ".join(filter(None, (*parts, f"seed {run.training.seed}", run.changes)))
 
 
 def card(arch: Arch, **more: Any) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import plushsense as ps
-from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.streams.run import TrainStreams, recipes_for
@@ -17,9 +16,7 @@ from plushsense.experiments.streams.score import PeopleFold
 from plushsense.experiments.streams.systems import ANYWHERE, WINDOWS
 from plushsense.training import fit as fitting
 from plushsense.windows.cut import WindowSet
-from plushsense.workflow.budget import make_network
 from plushsense.workflow.config import from_settings
-from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.preparation import outside_streams, prepare
 
 pytestmark = pytest.mark.apart("trainings")
@@ -54,12 +51,12 @@ def owners(dataset: Dataset, windows: WindowSet) -> set[str]:
 
 
 def test_a_fold_of_the_benchmark(rested: Dataset, trained: list[WindowSet], tmp_path: Path) -> None:
-    run = prepare(rested, from_settings(filters=(4, 4, 4), epochs=2, classes="all", hard_share=0.15))
+    run = prepare(rested, from_settings(filters=(4, 4, 4), epochs=2, classes="all"))
     fold = PeopleFold("fold 1", ("P1", "P2", "P3"), ("P4",), ("P5",))
     recipes = recipes_for(run.dataset, run, {WINDOWS, ANYWHERE}, None)
     TrainStreams(recipes, False, tmp_path)(run.dataset, fold, lambda *_: None)
-    # Gestures, anywhere without hard negatives, anywhere with them.
-    assert len(trained) == 3
+    # Gestures, and anywhere.
+    assert len(trained) == 2
     for windows in trained:
         assert owners(rested, windows) == {"P1", "P2", "P3"}
         assert NOBODY in windows.subject and "Rest" in np.array(windows.labels)[windows.y]
@@ -72,38 +69,7 @@ def test_a_training_that_fits_decisions(rested: Dataset, trained: list[WindowSet
     assert [owners(rested, windows) for windows in trained] == [everybody - {held}, everybody]
 
 
-def test_a_training_anywhere_adds_hard_negatives_of_the_training_people(
-    rested: Dataset, trained: list[WindowSet]
-) -> None:
-    settings = {"filters": (4, 4, 4), "epochs": 2, "classes": "all", "fit_decisions": False, "hard_share": 0.15}
-    bundle = ps.train(rested, context="anywhere", **settings).bundle
-    (held,) = set(bundle.provenance["validation_subjects"]) - {NOBODY}
-    everybody = {"P1", "P2", "P3", "P4", "P5"}
-    for theirs, first, second in ((everybody - {held}, *trained[:2]), (everybody, *trained[2:])):
-        assert len(first) <= len(second) <= 1.15 * len(first)
-        assert owners(rested, first) == owners(rested, second) == theirs
-
-
 def test_what_lies_in_no_stream_of_theirs(dataset: Dataset) -> None:
     windows = prepare(dataset, from_settings(classes="all")).scored_windows()
     assert (outside_streams(windows, dataset, {"P1", "P3"}) == ~np.isin(windows.subject, ["P1", "P3"])).all()
     assert outside_streams(windows, dataset, set()).all()
-
-
-def test_an_evaluation_that_would_leave_out_hard_negatives_is_refused(rested: Dataset, tmp_path: Path) -> None:
-    asked = from_settings(filters=(4, 4, 4), epochs=2, classes="all", context="anywhere", hard_share=0.15)
-    later = from_settings(filters=(4, 4, 4), epochs=2, classes="all", train_context="anywhere", hard_share=0.15)
-    for config in (asked, later):
-        with pytest.raises(ConfigError, match=r"^hard_share is 0.15, but an evaluation trains without hard negatives:"):
-            ps.evaluate(rested, config, split="by-subject:2")
-        with pytest.raises(ConfigError, match=r"^hard_share is 0.15"):
-            preview_evaluation(rested, config)
-    with pytest.raises(ConfigError, match=r"^hard_share is 0.15"):
-        make_network(rested, tmp_path / "model.plush", budget_s=60.0, config=asked)
-    assert not (tmp_path / "model.plush").exists()
-    said: list[str] = []
-    streams = [s for s in rested.streams if s.subject in ("P1", "P2")]
-    recordings = [r for r in rested.recordings if r.stream in {s.id for s in streams}]
-    two = Dataset(rested.path, rested.head, recordings, streams)
-    ps.train(two, asked, fit_decisions=False, warn=said.append)
-    assert sum(sentence.startswith("no hard negatives are added") for sentence in said) == 1

@@ -235,7 +235,7 @@ def baselines(
     """
     spec, dataset = spec or ComparisonSpec(), as_dataset(dataset)
     inputs = dataset.layout.inputs
-    given = config or from_settings(**settings)
+    given = from_settings(config, **settings)
     if given.windows.context == ANYWHERE:
         raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
     run = prepare(dataset, given, warn)

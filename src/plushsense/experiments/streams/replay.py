@@ -381,7 +381,8 @@ def score_events(
     for event in outside_insertions((*truths, *practice), by_gesture, late_s):
         out.places[_place(event, truth)] += 1
     named_affects = [AFFECTS[e.affect] for e in events]
-    out.cost = cost(truths, by_gesture, named_affects, families, affects, weights, late_s, practice)
+    kinds = {g.label: (families[g.label], g.affect) for g in gestures.gestures}
+    out.cost = cost(truths, by_gesture, named_affects, kinds, weights, late_s, practice)
     return out
 
 

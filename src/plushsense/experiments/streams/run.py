@@ -73,7 +73,6 @@ from plushsense.workflow.config import SHARED, RunConfig, from_settings
 from plushsense.workflow.preparation import (
     Run,
     Warn,
-    add_hard_negatives,
     choose_classes,
     classes_for,
     named_classes,
@@ -135,10 +134,6 @@ class TrainStreams:
         mine = np.isin(cut.subject, [*fold.train, NOBODY])
         train = cut.take(np.flatnonzero(mine & outside_streams(cut, dataset, {*fold.validation, *fold.test})))
         validation = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
-        train = add_hard_negatives(
-            train, dataset, arch, recipe.windows, recipe.anywhere, gestures, recipe.training,
-            {*fold.validation, *fold.test}, progress,
-        )  # fmt: skip
         fitted = fit(train, validation, arch, recipe.training, progress)
         calibrated = calibration(arch, fitted.weights, fitted.scaler, train.integers)
         people = {"subjects": list(fold.train), "validation_subjects": list(fold.validation)}
@@ -586,7 +581,7 @@ def stream_benchmark(
         out: a folder for the table as JSON and CSV, a page, and its figures.
     """
     spec = spec or BenchmarkSpec()
-    run = prepare(dataset, config or from_settings(**settings))
+    run = prepare(dataset, from_settings(config, **settings))
     dataset = run.dataset if spec.labels else run.dataset.without_stretches()
     names, seed = spec.names, run.evaluation.seed
     if out is not None:

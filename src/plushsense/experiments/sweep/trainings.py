@@ -75,7 +75,7 @@ class TrainAndScore:
 
     def __call__(self, shared: Any, task: Task, report: Report, /) -> Result:
         from plushsense.training.engine import FitState
-        from plushsense.training.fit import fit, predict
+        from plushsense.training.fit import StoreSpec, fit, predict
 
         sets, folds = shared
         windows, fold = sets[task.span], folds[task.span][task.fold]
@@ -90,12 +90,10 @@ class TrainAndScore:
 
         while epochs_left and fitted is None:
             spec = replace(task.spec, epochs=epochs_left[-1])
-            keep = epochs_left if task.nested else ()
             try:
-                fitted = fit(
-                    train, validation, task.arch, spec, lambda at, of, row: report((at, of, row["train_loss"])), keep,
-                    start=start, save=save if task.nested else None,
-                )  # fmt: skip
+                store = StoreSpec(start, epochs_left, save) if task.nested else StoreSpec(start)
+                shown = lambda at, of, row: report((at, of, row["train_loss"]))  # noqa: E731
+                fitted = fit(train, validation, task.arch, spec, shown, store)
             except DivergedError as cause:
                 failed[str(epochs_left[-1])] = str(cause)
                 epochs_left, start = epochs_left[:-1], None

@@ -64,7 +64,6 @@ _STAGES: Texts = {
     "refitting": "training again, on everybody",
     "fine-tuning": "fine-tuning for 8 bits",
     "deciding": "fitting the decision settings",
-    "first_network": "training a first network to find difficult moments",
     "evaluating": "testing on people left out",
     "learning": "measuring what more people would add",
 }
