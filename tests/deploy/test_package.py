@@ -212,7 +212,7 @@ def test_what_a_bundle_from_elsewhere_says_of_itself_cannot_break_out(tmp_path: 
 )
 def test_versions_and_pages_that_no_manifest_takes_are_refused(tmp_path: Path, given: dict[str, str]) -> None:
     with pytest.raises(ConfigError, match="is no .* accepted"):
-        export(bundle_of(window=60), tmp_path / "out", **given)
+        export(bundle_of(window=60), tmp_path / "out", package=PackageNames(**given))
 
 
 def test_what_the_manifests_name_exists(packages: Packages) -> None:

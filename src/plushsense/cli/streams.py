@@ -16,7 +16,8 @@ from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.experiments.protocol.score import ProtocolResult
-    from plushsense.experiments.streams.run import BenchmarkResult, PredictionsResult, StreamEvalResult
+    from plushsense.experiments.streams.run import PredictionsResult, StreamEvalResult
+    from plushsense.experiments.streams.score import BenchmarkResult
 
 
 def run_stream_eval(args: argparse.Namespace) -> int:

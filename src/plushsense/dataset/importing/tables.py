@@ -353,10 +353,12 @@ class TableImport:
             values = np.where(invalid[good], self.layout.valid_max_int + 1, values)
             words = ", ".join(f"'{word}'" for word in self.pattern.missing)
             yield f"{count} values are missing ({words}): they count as invalid"
-        frames = Frames(values, *(np.round(clock[good]).astype(np.int64) for clock in (device, host)))
-        numbers = (each[good] for each in (person, session, label, take * blocks + columns.blocks))
+        device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
+        person, session, label = (each[good] for each in (person, session, label))
+        take = (take * blocks + columns.blocks)[good]
         apart = "recording" in columns.names or columns.own_recordings or bool({"label", "recording"} & set(place))
-        return _TableSamples(frames, *numbers, people, sessions, labels, apart)
+        frames = Frames(values, device_ms, host_ms)
+        return _TableSamples(frames, person, session, label, take, people, sessions, labels, apart)
 
     def _write(
         self, table: TableFile, original: ConvertedSource, samples: _TableSamples, mine: NDArray[np.int64]

@@ -12,7 +12,7 @@ from plushsense.reports.table import DASH, Column, Table, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from plushsense.experiments.streams.run import BenchmarkResult
+    from plushsense.experiments.streams.score import BenchmarkResult
 
 # Okabe and Ito's colours; marker and line style distinguish the systems without colour.
 _LOOKS: dict[str, tuple[str, str, str]] = {

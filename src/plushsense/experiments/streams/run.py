@@ -48,10 +48,10 @@ from plushsense.experiments.streams.replay import (
     truth_of,
 )
 from plushsense.experiments.streams.score import (
+    BenchmarkResult,
     Fitted,
     PeopleFold,
     Settings,
-    SystemScores,
     crossvalidated_streams,
     people_folds,
     pooled_scores,
@@ -518,46 +518,17 @@ class BenchmarkSpec:
         return tuple(name for name in SYSTEMS if self.systems is None or name in self.systems)
 
 
-@dataclass(frozen=True)
-class BenchmarkResult(SystemScores):
-    """The result of `stream_benchmark`: the scores of the systems, and what they were made of.
+def save_benchmark(result: BenchmarkResult, out: Path) -> None:
+    """Write JSON, CSV with a row for each point of a curve, a page and its figures to a folder."""
+    from plushsense.experiments.streams.report import curves, latencies, page, point_table
+    from plushsense.reports.figures import png
 
-    ``labelled`` tells whether every sample of the streams has a label; ``networks`` has the title of each network.
-    """
-
-    split: str
-    dataset: str
-    dataset_hash: str
-    simulated: bool
-    labelled: bool
-    note: str
-    late_s: float
-    labelled_stretches: int
-    subjects: Sequence[str]
-    code_version: str
-    seed: int
-    networks: Mapping[str, str]
-    anywhere: Mapping[str, Any]
-    preset: str
-    training: Mapping[str, Any]
-
-    @property
-    def title(self) -> str:
-        """Data, people and split in one line."""
-        people = f"{len(self.subjects)} people left out in turn ({self.split})"
-        return f"{self.dataset}, {people}{': SIMULATION' * self.simulated}"
-
-    def save(self, out: Path) -> None:
-        """Write JSON, CSV with a row for each point of a curve, a page and its figures to a folder."""
-        from plushsense.experiments.streams.report import curves, latencies, page, point_table
-        from plushsense.reports.figures import png
-
-        out.mkdir(parents=True, exist_ok=True)
-        write_file(out / SHEET, point_table(self).csv())
-        (out / CURVES).write_bytes(png(curves(self), dpi=130))
-        (out / LATENCIES).write_bytes(png(latencies(self), dpi=130))
-        write_file(out / PAGE, page(self))
-        write_file(out / TABLE, json.dumps(vars(self), ensure_ascii=False, indent=1))
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / SHEET, point_table(result).csv())
+    (out / CURVES).write_bytes(png(curves(result), dpi=130))
+    (out / LATENCIES).write_bytes(png(latencies(result), dpi=130))
+    write_file(out / PAGE, page(result))
+    write_file(out / TABLE, json.dumps(vars(result), ensure_ascii=False, indent=1))
 
 
 def stream_benchmark(
@@ -622,5 +593,5 @@ def stream_benchmark(
     )
     if out is not None:
         with dataset.generation.writing():
-            result.save(Path(out))
+            save_benchmark(result, Path(out))
     return result

@@ -304,6 +304,36 @@ class SystemScores:
     folds: Sequence[Mapping[str, Any]]
 
 
+@dataclass(frozen=True)
+class BenchmarkResult(SystemScores):
+    """The result of `stream_benchmark`: the scores of the systems, and what they were made of.
+
+    ``labelled`` tells whether every sample of the streams has a label; ``networks`` has the title of each network.
+    """
+
+    split: str
+    dataset: str
+    dataset_hash: str
+    simulated: bool
+    labelled: bool
+    note: str
+    late_s: float
+    labelled_stretches: int
+    subjects: Sequence[str]
+    code_version: str
+    seed: int
+    networks: Mapping[str, str]
+    anywhere: Mapping[str, Any]
+    preset: str
+    training: Mapping[str, Any]
+
+    @property
+    def title(self) -> str:
+        """Data, people and split in one line."""
+        people = f"{len(self.subjects)} people left out in turn ({self.split})"
+        return f"{self.dataset}, {people}{': SIMULATION' * self.simulated}"
+
+
 def summed(folds: Folds) -> SystemScores:
     """Sum the counts of all folds."""
     names = [n for n in SYSTEMS if all(n in fold["systems"] for fold in folds)]
