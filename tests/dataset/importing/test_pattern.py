@@ -108,9 +108,9 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
         "files without such rows are left out",
         "the person is taken from the path",
     ]
-    assert preview_import(src, pattern=ImportPattern(**found)).gestures == {"Hold": 12, "Tap": 12}
+    assert preview_import(src, pattern=guessed.pattern).gestures == {"Hold": 12, "Tap": 12}
     shutil.copy(src / "P01" / "all day.csv", src / "P02" / "evening.csv")
-    assert preview_import(src, pattern=ImportPattern(**found)).gestures == {"Hold": 13, "Tap": 13}
+    assert preview_import(src, pattern=guessed.pattern).gestures == {"Hold": 13, "Tap": 13}
     one = tomllib.loads(guess_pattern(src / "P01" / "all day.csv").toml)
     assert (one["paths"], one["layout"]["name"]) == (["*.csv"], "all-day")
     for path in src.rglob("*.*"):
