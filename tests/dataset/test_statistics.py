@@ -11,7 +11,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.quality.measurements import summarize
-from plushsense.dataset.statistics import SummaryStatistics, channel_table, duration_bands, duration_table
+from plushsense.dataset.statistics import SummaryStatistics, duration_bands, duration_table
 from plushsense.dataset.store import Dataset, PersonInfo, write_people
 
 ACCEL = load_layout("accel-3")
@@ -74,14 +74,6 @@ def test_nobody_is_a_group_of_its_own(dataset: Dataset) -> None:
     write_people(dataset.path, [PersonInfo("P1", gender="f")])
     tap = duration_table(Dataset(dataset.path, dataset.head, resting, []), "gender")[0]
     assert (tap.group, tap.people) == ("nobody", 0)
-
-
-def test_channels_by_gesture(dataset: Dataset) -> None:
-    table = {(c.gesture, c.channel): c for c in channel_table(dataset)}
-    assert (table["Tap", "x"].mean, table["Tap", "y"].sd, table["Tap", "z"].rows) == (24.5, 0.0, 50)
-    x = np.concatenate([np.arange(n) for n in (100, 200, 300, 400)])
-    assert table["Wave", "x"].mean == pytest.approx(x.mean())
-    assert table["Wave", "x"].sd == pytest.approx(x.std())
 
 
 def test_the_band_of_the_paper_around_the_mean(dataset: Dataset) -> None:

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
-    statistics = bool(args.durations or args.by or args.channels)
+    statistics = bool(args.durations or args.by)
     if Path(args.path).suffix == ".plush":
         if statistics:
-            raise ConfigError(f"'{args.path}' is a bundle: --durations, --by and --channels describe a data set.")
+            raise ConfigError(f"'{args.path}' is a bundle: --durations and --by describe a data set.")
         return _bundle(args)
     from plushsense.dataset.index import open_dataset
 
@@ -71,27 +71,21 @@ def _bundle(args: argparse.Namespace) -> int:
 
 
 def _statistics(args: argparse.Namespace, dataset: Dataset) -> tuple[dict[str, Any], list[str]]:
-    """Return the durations of the recordings, and with ``--channels`` the values of the channels: JSON and text."""
-    from plushsense.dataset.statistics import channel_table, duration_table
+    """Return the durations of the recordings as JSON and as text."""
+    from plushsense.dataset.statistics import duration_table
 
     durations = duration_table(dataset, args.by)
-    channels = channel_table(dataset) if args.channels else []
     trimmed = sum(r.stop - r.start < r.rows for r in dataset.used)
     result: dict[str, Any] = {
         "by": args.by,
         "trimmed": trimmed,
         "durations": [asdict(d) for d in durations],
-        "channels": [asdict(c) for c in channels],
     }
     simulated = " (a simulation: it says nothing about people)" if dataset.head.simulated else ""
     text = [f"Durations{simulated}: {plural(len(dataset.used), 'recording')}, {trimmed} trimmed", ""]
     text += ["Whole recordings", _duration_table(durations, args.by, after=False), ""]
     if trimmed:
         text += ["After trimming", _duration_table(durations, args.by, after=True), ""]
-    if channels:
-        head = ("gesture", "channel", "unit", "rows", "mean", "sd")
-        rows = [(c.gesture, c.channel, c.unit, c.rows, f"{c.mean:.4g}", f"{c.sd:.4g}") for c in channels]
-        text += ["Channels, after trimming", table(head, rows)]
     return result, text
 
 

@@ -1,4 +1,4 @@
-"""Compute statistics of a data set: durations by gesture and group of people, and channel values by gesture.
+"""Compute statistics of a data set: durations by gesture and group of people.
 
 Durations have the statistics of the authors' ``b_training_data_analysis.m``: mean, median, variance and range.
 """
@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.gestures import NOBODY
@@ -162,43 +161,3 @@ def _grouping(dataset: Dataset, by: str) -> Callable[[str], str]:
         return str((vars(person) | person.more).get(by) or NOT_GIVEN)
 
     return group
-
-
-@dataclass(frozen=True)
-class ChannelSummary:
-    """Mean and standard deviation of one channel during one gesture, over all valid rows, in the raw unit."""
-
-    gesture: str
-    channel: str
-    unit: str
-    rows: int
-    mean: float
-    sd: float
-
-
-def channel_table(dataset: Dataset) -> list[ChannelSummary]:
-    """Compute mean and standard deviation of each channel by gesture, over the used recordings after trimming.
-
-    This reads every recording. Values outside a channel's valid range are left out. All rows have equal weight, so a
-    recording that was never stopped dominates.
-    """
-    layout = dataset.layout
-    steps = np.array([c.step for c in layout.channels])
-    sums: dict[str, NDArray[np.float64]] = {}
-    for r in sorted(dataset.used, key=lambda r: (r.stream, r.id)):
-        raw = dataset.read(r).values
-        valid = (raw >= layout.valid_min_int) & (raw <= layout.valid_max_int)
-        x = np.where(valid, raw * steps, 0.0)
-        part = np.stack([valid.sum(axis=0), x.sum(axis=0), (x * x).sum(axis=0)])
-        sums[r.gesture] = sums[r.gesture] + part if r.gesture in sums else part
-    out = []
-    for gesture in sorted(sums, key=lambda label: (_class_order(dataset, label), label)):
-        count, total, squares = sums[gesture]
-        mean = total / np.maximum(count, 1)
-        sd = np.sqrt(np.maximum(squares / np.maximum(count, 1) - mean**2, 0.0))
-        out += [
-            ChannelSummary(gesture, c.name, c.unit, int(count[i]), float(mean[i]), float(sd[i]))
-            for i, c in enumerate(layout.channels)
-            if count[i]
-        ]
-    return out
