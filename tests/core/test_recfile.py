@@ -80,7 +80,6 @@ def test_every_form_of_the_authors_files(tmp_path: Path, separator: str, header:
     back = read_recording(path, PLUSH)
     assert np.array_equal(back.frames.values, frames.values)
     assert np.array_equal(back.frames.host_ms, frames.host_ms)
-    assert back.had_header == header
 
 
 def test_delays_of_the_older_firmware_are_integrated(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.machine import FrameReader, Sample
 from plushsense.windows import self_calibration
-from plushsense.windows.clock import Segment, resample
+from plushsense.windows.clock import resample
 from plushsense.windows.cut import cut_windows
 from plushsense.windows.features import network_inputs
 from plushsense.windows.self_calibration import UNIT, SelfCalibration
@@ -131,26 +130,6 @@ def test_the_past_of_the_session_is_used_and_nothing_else(tmp_path: Path) -> Non
     assert cut_windows(dataset.with_inputs(replace(LAYOUT, self_calibration=()))).self_calibration == ""
     other = cut_windows(written(tmp_path / "b", LAYOUT, 4.0, -20_000))
     assert np.abs(windows.integers - other.integers).max() <= 0.02 * UNIT
-
-
-def test_a_session_can_be_read_from_another_state(tmp_path: Path) -> None:
-    class Twice(SessionReader):
-        def initial_state(self, session: Iterable[Segment]) -> SelfCalibration:
-            state = super().initial_state(())
-            for segment in session:
-                state.apply(segment.data)
-            return state
-
-    dataset = written(tmp_path, LAYOUT)
-    once, sessions = SessionReader(dataset), Twice(dataset)
-    data, state = resample(dataset.read_stream("ana/fulldatastream"), LAYOUT)[0].data, SelfCalibration(LAYOUT)
-    state.apply(data)
-    assert np.array_equal(sessions.stream("ana/fulldatastream")[0].data, state.apply(data))
-    ben = sorted((r for r in dataset.used if r.subject == "ben"), key=lambda r: r.epoch_ms)
-    whole, state = np.concatenate([resample(dataset.read(r), LAYOUT)[0].data for r in ben]), SelfCalibration(LAYOUT)
-    state.apply(whole)
-    assert np.array_equal(np.concatenate([sessions.recording(r)[0].data for r in ben]), state.apply(whole))
-    assert not np.array_equal(once.recording(ben[0])[0].data, sessions.recording(ben[0])[0].data)
 
 
 @pytest.mark.parametrize(

@@ -200,7 +200,6 @@ class ReadResult:
 
     Attributes:
         malformed: number of lines that were left out.
-        had_header: whether the file began with a header line.
         integrated: whether ``device_ms`` is a sum of delays, which starts at 0 in every file.
         cut: whether the last line had no line end and was left out; it counts as malformed.
     """
@@ -208,7 +207,6 @@ class ReadResult:
     frames: Frames
     warnings: list[str] = field(default_factory=list)
     malformed: int = 0
-    had_header: bool = False
     integrated: bool = False
     cut: bool = False
 
@@ -370,7 +368,7 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     values = table[:, [list(columns).index(n) for n in layout.names]]
     steps = np.array([c.step for c in layout.channels])
     frames = Frames(_as_whole(values if np.all(steps == 1.0) else values / steps), clock, host, labels)
-    return ReadResult(frames, warnings, malformed + cut, header, integrated, cut)
+    return ReadResult(frames, warnings, malformed + cut, integrated, cut)
 
 
 def read_recording(path: str | os.PathLike[str], layout: Layout, data: bytes | None = None) -> ReadResult:

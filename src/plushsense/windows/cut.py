@@ -129,13 +129,6 @@ class WindowSet:
         per_window = ("integers", "y", "recording", "subject", "context", "stream", "window_rows", "recording_rows")
         return replace(self, **{name: getattr(self, name)[index] for name in per_window})
 
-    def joined(self, other: WindowSet) -> WindowSet:
-        """Return these windows and those of another set of the same classes, inputs and length."""
-        names = ("integers", "y", "subject", "context", "stream", "window_rows", "recording_rows")
-        both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
-        recording = np.concatenate([self.recording, other.recording + len(self.recording_ids)])
-        return replace(self, **both, recording=recording, recording_ids=self.recording_ids + other.recording_ids)
-
     def only(self, inputs: Sequence[str]) -> WindowSet:
         """Return the windows with some of the inputs."""
         at = [self.inputs.index(name) for name in inputs]

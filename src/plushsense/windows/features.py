@@ -290,8 +290,3 @@ def statistics_in_order(x: NDArray[np.integer[Any]] | NDArray[np.floating[Any]],
     quarters = np.array_split(x, min(QUARTERS, x.shape[2]), axis=2)
     kept = (len(NAMES) - len(BANDS_HZ)) * x.shape[1]
     return np.concatenate([whole, *(statistics(quarter, rate_hz)[:, :kept] for quarter in quarters)], axis=1)
-
-
-def statistic_names(channels: Sequence[str]) -> tuple[str, ...]:
-    """Return the name of each column of `statistics`: "x mean", "y mean", …."""
-    return tuple(f"{channel} {name}" for name in NAMES for channel in channels)

@@ -8,7 +8,6 @@ without excluded ones. A recording with nothing before it, or of nobody, uses on
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -37,7 +36,7 @@ class SessionReader:
             return segments
         mine = [r for r in dataset.recordings if r.stream == stream and r.stream_row >= 0]
         mine.sort(key=lambda r: r.stream_row + r.start)
-        state, calibrated = self.initial_state(segments), []
+        state, calibrated = SelfCalibration(dataset.layout), []
         for segment in segments:
             parts, at = [], 0
             while mine and mine[0].stream_row + mine[0].start <= segment.row_of[-1]:
@@ -65,13 +64,6 @@ class SessionReader:
         state = self._states[recording.id].copy()
         return [replace(segment, data=state.apply(segment.data)) for segment in segments]
 
-    def initial_state(self, session: Iterable[Segment]) -> SelfCalibration:
-        """Return the state before the first sample of a stream or session, which is that of a toy that was switched on.
-
-        A subclass may return one that depends on the segments of the session, which is not causal.
-        """
-        return SelfCalibration(self._dataset.layout)
-
     def _follow(self, recording: RecordingInfo) -> None:
         """Store the state at the beginning of all recordings of the same stream, or session."""
         if recording.stream_row >= 0:
@@ -79,7 +71,7 @@ class SessionReader:
             return
         dataset = self._dataset
         if recording.subject in (NOBODY, UNKNOWN_SUBJECT):
-            self._states[recording.id] = self.initial_state(resample(dataset.read(recording), dataset.layout))
+            self._states[recording.id] = SelfCalibration(dataset.layout)
             return
         session = [
             r
@@ -88,7 +80,7 @@ class SessionReader:
         ]
         session.sort(key=lambda r: (r.epoch_ms, r.start_ms, r.id))
         read = {r.id: [] if r.excluded else resample(dataset.read(r), dataset.layout) for r in session}
-        state = self.initial_state(segment for segments in read.values() for segment in segments)
+        state = SelfCalibration(dataset.layout)
         for r in session:
             self._states[r.id] = state.copy()
             for segment in read[r.id]:

@@ -210,8 +210,7 @@ def train(
     scores are those of a network of fewer people. With early stopping, the validation people determine when to stop,
     so that the scores are slightly too high, and there is no second training. `evaluate` scores all people.
     The preset ``search`` splits windows as the paper does (70/15/15), which is leaky and marked as such.
-    ``context="anywhere"`` trains for live use (see `windows.anywhere`): idleness is a class, and the scored windows are
-    those of whole gestures with the real signal before them.
+    ``context="anywhere"`` trains for live use (see `windows.anywhere`): idleness is a class; scored are whole gestures.
 
     Args:
         config: settings; alternatively give them by name (see `from_settings`), as in ``preset="loso", epochs=20``.

@@ -385,9 +385,8 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         a preset that stops early (``loso``, ``paper``), 15 % of the people are held out for validation, or without
         groups 15 % of the windows, which is leaky. Other presets train on all of ``X``.
 
-        A window with the ``sample_weight`` 2 counts like two such windows, and one with 0 not at all; these weights,
-        times those of ``class_weight``, are scaled so that their mean is from 1 to 10. They have no effect on
-        validation.
+        A window with the ``sample_weight`` 2 counts like two such windows, and one with 0 not at all. These weights,
+        times those of ``class_weight``, are scaled to a mean of 1 to 10; they have no effect on validation.
         """
         from plushsense.training.fit import fit
 
