@@ -80,8 +80,9 @@ def source() -> Source:
             elif isinstance(node, ast.Call):
                 name = getattr(node.func, "id", getattr(node.func, "attr", ""))
                 counted = name == "plural" and isinstance(node.func, ast.Attribute)
-                if counted or name in TRANSLATORS or name == "PageTexts":
-                    given = [k.value for k in node.keywords] if name == "PageTexts" else node.args[:1]
+                if counted or name in TRANSLATORS or name in ("each", "PageTexts"):
+                    given = [k.value for k in node.keywords] if name == "PageTexts" else node.args
+                    given = given if name in ("each", "PageTexts") else given[:1]
                     found.texts.update(dict.fromkeys((t for v in given for t in texts_of(v)), place))
                 elif name in MESSAGES and node.args:
                     made = any(isinstance(part, ast.JoinedStr) for part in ast.walk(node.args[0]))

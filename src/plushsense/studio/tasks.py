@@ -1,9 +1,8 @@
 """Define the long tasks of the studio and the worker process in which `plushsense.studio.app.jobs` runs each one.
 
 The worker reads one line of JSON, ``{"task": ..., "spec": {...}}``, from standard input. It writes lines of JSON to
-standard output: ``{"progress": {...}}``, ``{"warning": ...}``, and finally ``{"result": {...}}`` or
-``{"refused": "...", "reason": "...", "values": {...}}`` for an error, see `plushsense.core.errors.PlushSenseError`. A
-process that ends with neither of these was stopped.
+standard output: ``{"progress": {...}}``, ``{"warning": ...}``, and finally ``{"result": {...}}`` or ``{"refused":
+{...}}``, a `Message` as JSON. A process that ends with neither of these was stopped.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
-from plushsense.studio.app.workspace import folder_digest
+from plushsense.studio.app.workspace import folder_digest, refusal_of
 from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
@@ -75,10 +74,6 @@ class TaskReporter:
         """Report that ``done`` of ``total`` items of a stage are done."""
         self.progress(stage=stage, done=done, total=total)
 
-    def refuse(self, message: Message) -> None:
-        """Report why the task has failed."""
-        self.write(refused=message.to_json())
-
     def warn(self, sentence: str) -> None:
         """Report a warning to the user."""
         self.write(warning=plain(sentence))
@@ -107,26 +102,18 @@ class Clock:
         return {"share": round(share, 4), "left_s": None if left is None else round(left, 1)}
 
 
-def run_check(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _check(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Check every recording of the data set ``spec["dataset"]`` and return counts of the findings."""
     report = check_dataset(spec["dataset"], progress=reporter.count)
-    counts = report.counts()
-    return {
-        "dataset": str(spec["dataset"]),
-        "recordings": report.recordings,
-        "undecided": len(report.undecided),
-        "by_severity": counts["by_severity"],
-        "by_check": counts["by_check"],
-        "hash": report.dataset.hash,
-        "seconds": round(report.seconds, 2),
-    }
+    by_severity = report.counts()["by_severity"]
+    return {"dataset": str(spec["dataset"]), "undecided": len(report.undecided), "by_severity": by_severity}
 
 
 UNPACKED = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
 """Limits for unpacking an uploaded zip."""
 
 
-def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Import ``sessions`` (folders in ``recordings``, collected in ``work``) into ``dest``.
 
     With ``add``, ``dest`` is an existing data set.
@@ -134,18 +121,9 @@ def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     settings: dict[str, Any] = {"add_to": True} if spec.get("add") else {"name": spec.get("name") or None}
     with _collected(spec) as source:
         done = import_recordings(source, spec["dest"], progress=reporter.count, **settings)
-    return {
-        "dataset": str(spec["dest"]),
-        "recordings": done.recordings,
-        "subjects": done.subjects,
-        "added": done.to_json()["added"],
-        "already_there": done.already_there,
-        "warnings": list(done.notes),
-        "flagged": len(done.warnings),
-        "left_out": [entry.to_json() for entry in done.left_out],
-        "rejected": [entry.to_json() for entry in done.rejected],
-        "seconds": round(done.seconds, 2),
-    }
+    stored = done.to_json()
+    result = {key: stored[key] for key in ("recordings", "subjects", "added", "rejected")}
+    return {**result, "dataset": str(spec["dest"]), "warnings": list(done.notes), "flagged": len(done.warnings)}
 
 
 @contextmanager
@@ -170,7 +148,7 @@ def _link_or_copy(source: str, target: str) -> str:
     return target
 
 
-def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Make the data set ``dest`` of the folder or file of each path in ``sources``; return what it contains.
 
     A source that cannot be imported is among ``rejected``, unless all are. ``layout`` and ``person`` may be "", see
@@ -227,7 +205,7 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     }
 
 
-def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Simulate ``people`` persons with ``repetitions`` as the new data set ``dest``; use ``work`` temporarily."""
     work = Path(spec["work"])
     work.mkdir(parents=True, exist_ok=True)
@@ -244,25 +222,21 @@ def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
     return {"dataset": str(spec["dest"]), "recordings": done["recordings"], "people": done["people"]}
 
 
-def run_backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Write the data set ``dataset`` into the new backup ``place``."""
     return {**asdict(backup(spec["dataset"], spec["place"], progress=reporter.count)), "dataset": spec["dataset"]}
 
 
-def run_restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Restore the backup ``file`` as the new data set ``dest`` with the name ``name``."""
     # One of the studio's own backups: only the disk limits it.
     limits = UnpackLimits(max(1, shutil.disk_usage(Path(spec["file"]).parent).free), files=1 << 30)
     dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits)
     write_file(dataset.path / HEAD, replace(dataset.head, name=spec["name"]).to_toml())
-    return {
-        "dataset": str(spec["dest"]),
-        "recordings": len(dataset.recordings),
-        "people": len(dataset.subjects),
-    }
+    return {"dataset": str(spec["dest"]), "recordings": len(dataset.recordings), "people": len(dataset.subjects)}
 
 
-def run_forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Remove ``person`` from ``dataset``; the result does not name the person.
 
     Raises:
@@ -273,7 +247,7 @@ def run_forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     return {"dataset": spec["dataset"], "files": len(forget(spec["dataset"], spec["person"]).files)}
 
 
-def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Publish ``dataset`` as the package ``place``; the other keys are those of `PublishSpec`."""
     key = spec.get("key") or None
     if key is not None:
@@ -287,12 +261,12 @@ def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     return publish_dataset(spec["dataset"], spec["place"], PublishSpec(**options), reporter.stage).to_dict()
 
 
-def run_validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Validate the package ``place``, a folder or a zip; with ``thorough``, all validators read every row."""
     return validate_package(spec["place"], thorough=spec.get("thorough", False), progress=reporter.stage).to_dict()
 
 
-def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("dry"):
@@ -327,24 +301,15 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         warn=reporter.warn,
     )
     bundle = done.save(free_path(out, done.bundle.to_bytes()))
-    return {
-        "bundle": str(bundle),
-        "scores": done.scores.to_json(),
-        "seconds": round(done.seconds, 1),
-        "parameters": done.bundle.arch.parameters,
-        "title": done.bundle.arch.title,
-        "epochs": len(done.history),
-        "fitted": done.bundle.decision.get("fitted") is not None,
-    }
+    return {"bundle": str(bundle)}
 
 
-def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Train a network and evaluate it on people left out, in about ``minutes``; see `make_network`."""
     out = Path(spec["out"])
     reporter.progress(stage="reading", share=0.0)
 
     from plushsense.workflow.budget import BudgetProgress, make_network
-    from plushsense.workflow.reporting import load_evaluation
 
     clock = Clock()
 
@@ -363,23 +328,10 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         progress=report,
         warn=reporter.warn,
     )
-    return {**_evaluation(load_evaluation(done.evaluation)), **done.to_json(), "out": str(done.evaluation)}
+    return {**done.to_json(), "out": str(done.evaluation)}
 
 
-def _evaluation(table: dict[str, Any]) -> dict[str, Any]:
-    """Return the part of a stored evaluation that the card of its job shows."""
-    keys = ("split", "leaky", "context", "simulated", "seeds", "over", "accuracy", "macro_f1")
-    people = [{key: row[key] for key in ("subject", "accuracy")} for row in table["subjects"]]
-    return {
-        **{key: table[key] for key in keys},
-        "units": len(table[table["over"]]),
-        "classes": len(table["per_class"]),
-        "people": people,
-        "nobody": table["nobody"],
-    }
-
-
-def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Evaluate; return the output folder, the report and the main scores, or the estimate for a dry run."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("split"):
@@ -392,7 +344,7 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
     from plushsense.workflow.api import evaluate_run
     from plushsense.workflow.preparation import prepare
-    from plushsense.workflow.reporting import PAGE, load_evaluation, write_report
+    from plushsense.workflow.reporting import PAGE, write_report
 
     dataset = open_dataset(spec["dataset"])
     made = prepare(dataset, config, reporter.warn)
@@ -406,11 +358,11 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
         reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **loss, **clock.at(at.share))
 
     evaluate_run(made, out=out, int8=bool(spec.get("int8")), progress=fold, warn=reporter.warn)
-    report = write_report(out / PAGE, dataset, [out])
-    return {"out": str(out), "report": str(report), **_evaluation(load_evaluation(out))}
+    write_report(out / PAGE, dataset, [out])
+    return {"out": str(out)}
 
 
-def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Run a sweep; return the folder ``out`` and main values of the result, or the preview for a dry run."""
     from plushsense.experiments.sweep.run import SweepProgress, preview, sweep
 
@@ -433,18 +385,16 @@ def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     for lost in done.failed:
         network = f"{lost.arch} {lost.filters}"
         reporter.warn(Message("The network {network} was given up, because its training failed.", network=network))
-    keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
     stored = done.to_json()
-    halving = {key: stored["halving"][key] for key in ("winner", "smallest_equal")} if done.halving else {}
-    return {"out": str(done.out), **{key: stored[key] for key in keys}, **halving}
+    return {"out": str(done.out), "best": stored["best"], "winner": stored["halving"]["winner"] if done.halving else {}}
 
 
-def run_profile(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _profile(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Profile the exported code in the folder ``spec["place"]``."""
-    return {"profile": _profile(Path(spec["place"]), reporter)}
+    return {"profile": _profile_of(Path(spec["place"]), reporter)}
 
 
-def _profile(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
+def _profile_of(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
     """Return the profile of an export, or the reason ``refused`` why there is none, with a ``digest`` of the files."""
     digest = folder_digest(folder)
     reporter.progress(stage="profile")
@@ -455,7 +405,7 @@ def _profile(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
         return {"digest": digest, "refused": refusal.message}
 
 
-def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Export ``bundle`` to ``place``, in the formats ``also`` too; calibrate it again if ``dataset`` is not ""."""
     reporter.progress(stage="export")
     done = export(
@@ -465,13 +415,13 @@ def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         also=spec.get("also", ()),
         warn=reporter.warn,
     )
-    return {**done.to_json(), "profile": _profile(Path(spec["place"]), reporter)}
+    return {**done.to_json(), "profile": _profile_of(Path(spec["place"]), reporter)}
 
 
 _SAMPLES = 100_000
 
 
-def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+def _verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Verify the export ``place`` on ``targets``, by default on all that are available.
 
     The input is recordings of ``dataset`` if given, else generated data. With ``faults``, check that mutants of the
@@ -495,23 +445,23 @@ def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
-    "check": run_check,
-    "make": run_make,
-    "train": run_train,
-    "sweep": run_sweep,
-    "search": run_sweep,
-    "evaluate": run_evaluate,
-    "import": run_import,
-    "inspect": run_inspect,
-    "publish": run_publish,
-    "export": run_export,
-    "verify": run_verify,
-    "simulate": run_simulate,
-    "profile": run_profile,
-    "validate": run_validate,
-    "backup": run_backup,
-    "restore": run_restore,
-    "forget": run_forget,
+    "check": _check,
+    "make": _make,
+    "train": _train,
+    "sweep": _sweep,
+    "search": _sweep,
+    "evaluate": _evaluate,
+    "import": _import,
+    "inspect": _inspect,
+    "publish": _publish,
+    "export": _export,
+    "verify": _verify,
+    "simulate": _simulate,
+    "profile": _profile,
+    "validate": _validate,
+    "backup": _backup,
+    "restore": _restore,
+    "forget": _forget,
 }
 """Functions of the tasks by name. Specs and results contain only JSON values."""
 
@@ -529,15 +479,15 @@ def main() -> int:
     except KeyboardInterrupt:
         return 1
     except PlushSenseError as refusal:
-        reporter.refuse(refusal.message)
+        reporter.write(refused=refusal.message.to_json())
         return 2
     except OSError as cause:
-        where = f" ({cause.filename})" if cause.filename else ""
-        reporter.refuse(Message("The computer refused: {why}{where}.", why=cause.strerror or str(cause), where=where))
+        reporter.write(refused=refusal_of(cause).to_json())
         return 2
     except Exception as cause:  # noqa: BLE001, RUF100
         what = f"{type(cause).__name__}: {cause}"
-        reporter.refuse(Message("The work broke off: {what}. What was finished is kept.", what=what))
+        message = Message("The work broke off: {what}. What was finished is kept.", what=what)
+        reporter.write(refused=message.to_json())
         return 2
     return 0
 

@@ -21,17 +21,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from plushsense.core.errors import ConfigError, need
-from plushsense.studio.app.guard import (
-    HEAD_BYTES,
-    TOKEN,
-    ConnectionLimits,
-    Guard,
-    Visitors,
-    drop_slow_clients,
-    is_loopback,
-    limited_protocol,
-    mark_scripts,
-)
+from plushsense.studio.app.connections import ConnectionLimits, drop_slow_clients, limited_protocol
+from plushsense.studio.app.guard import HEAD_BYTES, TOKEN, Guard, Visitors, is_loopback, mark_scripts
 from plushsense.studio.app.workspace import WORK, Workspace
 
 PORT = 8137
@@ -82,23 +73,13 @@ def run(
     with _without_clients():
         need("nicegui", "studio")
         from nicegui import app, ui
-        from nicegui.client import templates
-
-    from plushsense.studio.app.guard import router
-    from plushsense.studio.app.shell import PAGES
 
     lock = _lock_folder(workspace)
     port = _free_port(host, port)
-    for name, path in PAGES.items():
-        ui.page(path, response_timeout=30.0)(_page(workspace, name))
-    app.include_router(router(workspace))
     everywhere = host in _EVERYWHERE
     if everywhere:
         names = (*names, socket.gethostname(), *_addresses())
     visitors = Visitors(host, names)
-    inner: Any = app.build_middleware_stack
-    # The guard must be the outermost layer, even around error responses; app.add_middleware would put it further in.
-    vars(app)["build_middleware_stack"] = lambda: Guard(inner(), visitors)
     host_name = (_addresses() or [socket.gethostname()])[0] if everywhere else host
     address = f"http://{f'[{host_name}]' if ':' in host_name else host_name}:{port}/"
     if not visitors.open:
@@ -110,16 +91,8 @@ def run(
         on_ready(workspace.invite() if workspace.invite else address)
 
     limits = ConnectionLimits.of_process()
-    # NiceGUI warns about its own tasks that are still running at shutdown; users cannot act on that.
-    logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
-    mark_scripts(templates.env, "index.html")
-    # Switch off Quasar's loading bar, because it has no accessible name.
-    app.config.quasar_config["loadingBar"] = {"skipHijack": True}
-    app.config.vue_config_script = _ALERTS + _ICONS.read_text(encoding="utf-8") + app.config.vue_config_script
+    _configure(workspace, visitors)
     app.on_startup(lambda: threading.Thread(target=announce, daemon=True).start())
-    app.on_startup(_watch_clients)
-    app.on_delete(_release_memory())
-    app.on_shutdown(workspace.close)
     ui.run(
         host=host,
         port=port,
@@ -138,6 +111,31 @@ def run(
     )
     if lock is not None:
         lock.release()
+
+
+def _configure(workspace: Workspace, visitors: Visitors) -> None:
+    """Add the pages, the guard and the tasks of the studio to NiceGUI's application."""
+    from nicegui import app, ui
+    from nicegui.client import templates
+
+    from plushsense.studio.app.guard import router
+    from plushsense.studio.app.shell import PAGES
+
+    for name, path in PAGES.items():
+        ui.page(path, response_timeout=30.0)(_page(workspace, name))
+    app.include_router(router(workspace))
+    inner: Any = app.build_middleware_stack
+    # The guard must be the outermost layer, even around error responses; app.add_middleware would put it further in.
+    vars(app)["build_middleware_stack"] = lambda: Guard(inner(), visitors)
+    # NiceGUI warns about its own tasks that are still running at shutdown; users cannot act on that.
+    logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
+    mark_scripts(templates.env, "index.html")
+    # Switch off Quasar's loading bar, because it has no accessible name.
+    app.config.quasar_config["loadingBar"] = {"skipHijack": True}
+    app.config.vue_config_script = _ALERTS + _ICONS.read_text(encoding="utf-8") + app.config.vue_config_script
+    app.on_startup(_watch_clients)
+    app.on_delete(_release_memory())
+    app.on_shutdown(workspace.close)
 
 
 @contextlib.contextmanager

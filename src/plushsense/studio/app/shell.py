@@ -22,7 +22,7 @@ from nicegui.translations import translations
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.studio.app.words import LANGUAGES, PageTexts, Texts, Words
-from plushsense.studio.app.workspace import ChangeSignal, Workspace
+from plushsense.studio.app.workspace import ChangeSignal, Workspace, refusal_of
 
 _CONNECTION: Texts = {
     "connection_lost": "The connection to the studio is lost.",
@@ -177,11 +177,7 @@ class Page:
         except PlushSenseError as refusal:
             self.say(self.words.error(refusal), "error")
         except OSError as cause:
-            where = f" ('{cause.filename}')" if cause.filename else ""
-            self.say(
-                self.words("The computer refused: {why}{where}.", where=where, why=cause.strerror or str(cause)),
-                "error",
-            )
+            self.say(self.words.error(refusal_of(cause)), "error")
 
 
 def visitor() -> tuple[Words, bool | None]:

@@ -71,6 +71,10 @@ class Words:
         translated = str(self._translation(text) or text.rpartition(_CONTEXT)[2])
         return translated.format(**values) if values else translated
 
+    def each(self, *texts: str) -> list[str]:
+        """Return the translations of several texts, such as the headings of a table."""
+        return [self(text) for text in texts]
+
     def plural(self, one: str, many: str, n: int) -> str:
         """Return the text for a number, which replaces ``{n}``, in the form that the language has for it."""
         forms = self._translation(one)

@@ -44,6 +44,7 @@ KINDS_OF_TRAINING: Texts = {
 }
 """Names of the jobs of the train page."""
 
+JOB_STATES: Texts = {"running": "running", "done": "done", "refused": "failed", "stopped": "stopped"}
 _CSS = Path(__file__).with_name("elements.css")
 _RECENT_S = 900.0
 _TITLES = {
@@ -172,6 +173,22 @@ def summary(text: str) -> ui.html:
     """Add the heading of a collapsible part of the page, which stays visible when the part is folded."""
     style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"
     return html(text, "summary").style(style)
+
+
+MAX_LINES = 40
+"""Most lines of a list of notes that a page shows."""
+
+
+def folded_lines(words: Words, title: str, lines: Sequence[str], name: str = "") -> None:
+    """Add a folded list of lines, if there are any; no more than `MAX_LINES` of them are shown."""
+    if not lines:
+        return
+    with tag(ui.element("details").classes("w-full"), name):
+        summary(title)
+        for line in lines[:MAX_LINES]:
+            ui.label(line).classes("ps-break ps-note")
+        if len(lines) > MAX_LINES:
+            ui.label(words("and {n} more", n=len(lines) - MAX_LINES)).classes("ps-dim")
 
 
 def verdict(good: bool | None, word: str) -> Markup:

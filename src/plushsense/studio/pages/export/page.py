@@ -45,41 +45,6 @@ _NEXT_STEPS: Texts = {
     "read": "README.md in the export describes how to pass frames, what is returned, and what is required.",
 }
 
-_HEADS: Texts = {
-    "target": "Target",
-    "compiler": "Compiler",
-    "flags": "Flags",
-    "answers": "Answers",
-    "mismatches": "Different",
-    "difference": "Largest difference",
-    "verdict": "Verdict",
-    "stream": "Input",
-    "samples": "Samples",
-    "frames": "Frames",
-    "fault_kind": "Where",
-    "fault": "Fault",
-    "chip": "Chip",
-    "mhz": "MHz",
-    "estimate": "ms per step, estimated",
-    "fits": "In time?",
-    "counted_on": "Measured on",
-    "instructions": "Instructions per step",
-    "flash_all": "Flash with code (bytes)",
-    "ram_all": "RAM (bytes)",
-    "stack": "Stack (bytes)",
-    "name": "Name",
-    "network": "Network structure",
-    "data": "Data",
-    "made": "Created",
-    "last_proof": "Last verification",
-}
-
-_OUTCOMES: Texts = {
-    "caught": "detected",
-    "not_shown": "cannot be detected",
-    "not_caught": "NOT detected",
-}
-
 _STAGES: Texts = {
     "begin": "Starting …",
     "export": "Writing the C and the golden vectors …",
@@ -88,12 +53,7 @@ _STAGES: Texts = {
     "verify": "Compiling and running …",
 }
 
-_FITS_TEXTS: Texts = {
-    "yes": "yes",
-    "no": "no",
-    "unsure": "not sure",
-}
-
+_FITS_TEXTS: Texts = {"yes": "yes", "no": "no", "unsure": "not sure"}
 _FITS = {"yes": True, "no": False, "unsure": None}
 
 
@@ -139,7 +99,7 @@ def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
         for each in profile["estimated_ms"].values()
     ]
     if rows:
-        head = [words(_HEADS[k]) for k in ("chip", "mhz", "estimate", "fits")]
+        head = words.each("Chip", "MHz", "ms per step, estimated", "In time?")
         tag(table(words("Estimated time of a step on real chips, {when}", when=when), head, rows, (1,)), "estimates")
     counted = [
         (
@@ -151,13 +111,11 @@ def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
         if each["instructions_per_step"] is not None
     ]
     if counted:
-        head = [words(_HEADS[k]) for k in ("counted_on", "instructions", "flash_all", "ram_all", "stack")]
-        table(
-            words("Measured on emulators, compiled with {optimise}", optimise=profile["optimise"]),
-            head,
-            counted,
-            (1, 2, 3, 4),
+        head = words.each(
+            "Measured on", "Instructions per step", "Flash with code (bytes)", "RAM (bytes)", "Stack (bytes)"
         )
+        caption = words("Measured on emulators, compiled with {optimise}", optimise=profile["optimise"])
+        table(caption, head, counted, (1, 2, 3, 4))
     for name, packages in profile["missing"].items():
         text(_missing_target(words, TARGETS[name].title, packages), classes="ps-dim")
 
@@ -338,13 +296,8 @@ class VerificationCard:
         words, result = self.words, proof.result
         with tag(ui.column().classes("w-full"), "verdict"):
             if result["digest"] != self.export.digest:
-                text(
-                    words(
-                        "The files have changed since this verification of {when}. Verify again.",
-                        when=moment(proof.ended_s),
-                    ),
-                    classes="ps-message ps-message-warning w-full",
-                )
+                when = moment(proof.ended_s)
+                notice(words("The files have changed since this verification of {when}. Verify again.", when=when))
             good, outcome = _outcome(words, result)
             with ui.row().classes("items-center"):
                 html(verdict(good, outcome))
@@ -363,29 +316,19 @@ class VerificationCard:
                 )
                 for r in result["runs"]
             ]
-            keys = ("target", "compiler", "flags", "answers", "mismatches", "difference", "verdict")
             caption = words("Compiled and run programs, {when}", when=moment(proof.ended_s))
-            tag(table(caption, [words(_HEADS[k]) for k in keys], rows, (3, 4, 5)), "runs")
+            head = words.each("Target", "Compiler", "Flags", "Answers", "Different", "Largest difference", "Verdict")
+            tag(table(caption, head, rows, (3, 4, 5)), "runs")
             counts = ("samples", "frames", "answers")
             streams = [(s["name"], *(words.count(s[key]) for key in counts)) for s in result["streams"]]
-            head = [words(_HEADS[k]) for k in ("stream", *counts)]
-            tag(
-                table(
-                    words(
-                        "Inputs of each program (scenario: the network with other rules; golden: the vectors of the "
-                        "export)"
-                    ),
-                    head,
-                    streams,
-                    (1, 2, 3),
-                ),
-                "streams",
+            caption = words(
+                "Inputs of each program (scenario: the network with other rules; golden: the vectors of the export)"
             )
+            head = words.each("Input", "Samples", "Frames", "Answers")
+            tag(table(caption, head, streams, (1, 2, 3)), "streams")
             for each in result["not_run"]:
-                text(
-                    words("Not run: {what} ({why}).", what=each["what"], why=words.sentence(each["why"])),
-                    classes="ps-dim",
-                )
+                why = words.sentence(each["why"])
+                text(words("Not run: {what} ({why}).", what=each["what"], why=why), classes="ps-dim")
             if result["faults"]:
                 self._mutants(result["faults"])
 
@@ -414,28 +357,28 @@ class VerificationCard:
                 words("An inserted fault was not detected: the golden vectors of this export are too weak for it.")
             )
         if not result["own"]:
-            sentences.append(
+            sentences += [
                 words(
                     "The code in this folder is not what this version of PlushSense writes for the .plush file in "
                     "it. Equal answers say nothing about what else it does. Export again to be sure."
-                )
-            )
-            sentences.append(
-                words("These files are not what PlushSense writes: {files}", files=", ".join(result["changed"]))
-            )
+                ),
+                words("These files are not what PlushSense writes: {files}", files=", ".join(result["changed"])),
+            ]
         return sentences
 
     def _mutants(self, faults: Sequence[dict[str, Any]]) -> None:
         words = self.words
-        kinds = {True: "caught", None: "not_shown", False: "not_caught"}
         rows = []
         for each in faults:
-            state = True if each["caught"] else None if each["silent"] else False
-            cell = verdict(state, words(_OUTCOMES[kinds[state]]))
+            if each["caught"]:
+                cell = verdict(True, words("detected"))
+            elif each["silent"]:
+                cell = verdict(None, words("cannot be detected"))
+            else:
+                cell = verdict(False, words("NOT detected"))
             rows.append((each["kind"], each["fault"], self._title(each["target"]), cell))
         with ui.expansion(words("{n} inserted faults", n=len(rows))).classes("w-full"):
-            head = [words(_HEADS[k]) for k in ("fault_kind", "fault", "target", "verdict")]
-            table(words("Inserted faults, one at a time"), head, rows)
+            table(words("Inserted faults, one at a time"), words.each("Where", "Fault", "Target", "Verdict"), rows)
             if any(f["silent"] for f in faults):
                 text(
                     words("Cannot be detected: no test scenario of this network depends on that line of the rules."),
@@ -674,5 +617,5 @@ class _Exporting:
             if not rows:
                 text(words("There are no exports yet."), classes="ps-dim")
                 return
-            keys = ("name", "network", "data", "made", "last_proof")
-            table(words("Exports of this studio, the newest first"), [words(_HEADS[k]) for k in keys], rows)
+            head = words.each("Name", "Network structure", "Data", "Created", "Last verification")
+            table(words("Exports of this studio, the newest first"), head, rows)

@@ -32,17 +32,7 @@ from plushsense.studio.app.shell import Page, button, heading, on_change, on_pag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace, plain_name
 from plushsense.studio.pages.home.sections import simulation_badge, titled_card
-from plushsense.studio.widgets.elements import errors_beside, facts, notice, summary
-
-_CHOOSE: Texts = {
-    "choose_files": "Choose files",
-    "choose_folder": "Choose a folder",
-}
-
-_FOLDS: Texts = {
-    "preview_gestures": "Gestures: {n}",
-    "rejected": "Files that are not imported: {n}",
-}
+from plushsense.studio.widgets.elements import MAX_LINES, errors_beside, facts, folded_lines, notice
 
 _LAYOUTS: Texts = {
     "plush-15": "plush toy",
@@ -58,7 +48,6 @@ _LIMITS = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
 _ACCEPTED = ".zip,.plush,.csv,.xdf,.xdfz,.parquet"
 # Files that desktops leave in folders; nobody chose them.
 _OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
-_MAX_LINES = 40
 
 
 def _about(file: str, note: Message) -> Message:
@@ -227,10 +216,11 @@ class IncomingSection:
             with UploadArea(self._store, self._finish, texts) as area, ui.column().classes("w-full ps-small-gap"):
                 ui.label(about).classes("ps-dim")
                 with ui.row().classes("ps-small-gap"):
-                    for key, folder in (("choose_files", "false"), ("choose_folder", "true")):
-                        choose = button(key, words(_CHOOSE[key]), icon="folder" if folder == "true" else "upload_file")
-                        # In the browser, since it opens its dialog only as the answer to a click.
-                        choose.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [{folder}])")
+                    files = button("choose_files", words("Choose files"), icon="upload_file")
+                    folder = button("choose_folder", words("Choose a folder"), icon="folder")
+                    # In the browser, since it opens its dialog only as the answer to a click.
+                    files.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [false])")
+                    folder.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [true])")
             self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
         on_change(jobs.changed, self._update)
         context.client.on_delete(self._leave)
@@ -268,7 +258,7 @@ class IncomingSection:
             page.say(words("The network “{name}” is added.", name="”, “".join(added)), "good")
             await self._refresh()
         if refused:
-            page.say(" ".join(words.sentence(note) for note in refused[:_MAX_LINES]), "error")
+            page.say(" ".join(words.sentence(note) for note in refused[:MAX_LINES]), "error")
         if incoming.sources:
             self._inspect()
 
@@ -342,7 +332,7 @@ class IncomingSection:
         ]
         facts(rows)
         gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
-        self._lines("preview_gestures", gestures)
+        folded_lines(words, words("Gestures: {n}", n=len(gestures)), gestures, "preview_gestures")
         notes = [words.sentence(n) for n in result["notes"] if not _is_of_preview(n)]
         if result["flagged"]:
             notes.append(
@@ -350,17 +340,8 @@ class IncomingSection:
             )
         for note in notes:
             ui.label(note).classes("ps-note ps-break")
-        self._lines("rejected", [f"{r['file']}: {words.sentence(r['reason'])}" for r in result["rejected"]])
-
-    def _lines(self, key: str, lines: list[str]) -> None:
-        if not lines:
-            return
-        with tag(ui.element("details").classes("w-full"), key):
-            summary(self._words(_FOLDS[key], n=len(lines)))
-            for line in lines[:_MAX_LINES]:
-                ui.label(line).classes("ps-break ps-note")
-            if len(lines) > _MAX_LINES:
-                ui.label(self._words("and {n} more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
+        rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result["rejected"]]
+        folded_lines(words, words("Files that are not imported: {n}", n=len(rejected)), rejected, "rejected")
 
     def _settings(self, current: str, unknown_person: bool, unknown_layout: bool) -> None:
         """Add the fields of what the files do not state: the layout, and the person where it is not known."""

@@ -15,7 +15,16 @@ from plushsense.studio.app.shell import Page, address, button, html, moment, nam
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BACKUPS, DATASETS, DISCARDED
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
-from plushsense.studio.widgets.elements import ask, change_files, errors_beside, item_menu, summary, title_of
+from plushsense.studio.widgets.elements import (
+    JOB_STATES,
+    ask,
+    change_files,
+    errors_beside,
+    folded_lines,
+    item_menu,
+    summary,
+    title_of,
+)
 
 _KINDS: Texts = {
     "recordings": "Session",
@@ -29,24 +38,6 @@ _STATES: Texts = {
     "active": "being recorded now",
     "finished": "finished",
     "unfinished": "not finished",
-}
-
-_JOB_STATES: Texts = {
-    "running": "running",
-    "done": "done",
-    "refused": "failed",
-    "stopped": "stopped",
-}
-
-_ACTIONS: Texts = {
-    "stop": "Stop",
-    "again": "Start again",
-    "drop": "Remove from the list",
-}
-
-_FOLDS: Texts = {
-    "warnings": "Warnings: {n}",
-    "rejected": "Files that are not imported: {n}",
 }
 
 SMALL = 'outline padding="4px 12px"'
@@ -68,7 +59,6 @@ PAGE_OF = {
 """Maps each task to the page that displays its result."""
 _SIGNS = {RUNNING: "▶", DONE: "✓", REFUSED: "✕", STOPPED: "■"}
 _MAX_EARLIER = 6
-_MAX_LINES = 40
 
 
 def titled_card(page: Page, title: str, name: str) -> ui.card:
@@ -307,7 +297,7 @@ class JobList:
             bar = ui.linear_progress(0.0, show_value=False, size="10px").props("rounded")
             self._progress_bars[job.id] = (label, named(bar, title))
         else:
-            ui.label(f"{words(_JOB_STATES[job.state])} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
+            ui.label(f"{words(JOB_STATES[job.state])} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
         if job.state == REFUSED:
             ui.label(words.failure(job.refusal)).classes("ps-bad ps-break")
         if job.state == DONE:
@@ -316,18 +306,18 @@ class JobList:
             if job.state == DONE and job.task in PAGE_OF:
                 page_links(self._page, (PAGE_OF[job.task],), title, dataset=job.result.get("dataset") or "")
             if job.state == RUNNING:
-                self._button("stop", job, lambda: self._jobs.stop(job.id))
+                self._button("stop", words("Stop"), title, lambda: self._jobs.stop(job.id))
                 return
             if job.state == STOPPED:
-                self._button("again", job, lambda: self._jobs.resume(job.id))
-            self._button("drop", job, lambda: self._jobs.drop(job.id))
+                self._button("again", words("Start again"), title, lambda: self._jobs.resume(job.id))
+            self._button("drop", words("Remove from the list"), title, lambda: self._jobs.drop(job.id))
 
-    def _button(self, key: str, job: StudioJob, action: Callable[[], object]) -> None:
+    def _button(self, key: str, label: str, title: str, action: Callable[[], object]) -> None:
         def clicked() -> None:
             with self._page.show_errors():
                 action()
 
-        button(f"job-{key}", self._page.words(_ACTIONS[key]), clicked, SMALL, about=title_of(self._page.words, job))
+        button(f"job-{key}", label, clicked, SMALL, about=title)
 
     def _progress(self, job: StudioJob) -> tuple[str, float | None]:
         """Return the progress as text, and as a fraction from 0 to 1 (None if unknown)."""
@@ -365,10 +355,5 @@ class JobList:
                 words("Recordings with something to look at: {n}. The page Review shows them.", n=result["flagged"])
             )
         rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result.get("rejected", ())]
-        for key, lines in (("warnings", warnings), ("rejected", rejected)):
-            if lines:
-                with ui.expansion(words(_FOLDS[key], n=len(lines))).classes("w-full").props("dense"):
-                    for line in lines[:_MAX_LINES]:
-                        ui.label(line).classes("ps-break ps-note")
-                    if len(lines) > _MAX_LINES:
-                        ui.label(words("and {n} more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
+        folded_lines(words, words("Warnings: {n}", n=len(warnings)), warnings)
+        folded_lines(words, words("Files that are not imported: {n}", n=len(rejected)), rejected)
