@@ -31,6 +31,15 @@ _LOCALE = Path(__file__).parents[1] / "locale"
 # The separator that gettext uses between context and text.
 _CONTEXT = "\x04"
 UNITS: Texts = {"count": "counts"}
+CHANNEL_KINDS: Texts = {
+    "all": "All",
+    "activity": "Activity",
+    "capacitive": "Touch",
+    "proximity": "Proximity",
+    "acceleration": "Acceleration",
+    "angular rate": "Rotation",
+}
+"""Names of the groups of channels."""
 AFFECTS: Texts = {"positive": "positive", "neutral": "neutral", "negative": "negative", "none": "none"}
 
 

@@ -106,6 +106,20 @@ def on_enter(field: Element, call: Callable[[], Any]) -> None:
     field.on("keydown.enter", call, js_handler=f'() => {{ window.addEventListener("keyup", {drop}); emit(); }}')
 
 
+@contextmanager
+def open_dialog(label: str, name: str, classes: str = "") -> Iterator[ui.dialog]:
+    """Open a dialog with the elements that are added in the block; it is deleted when it is closed.
+
+    It has no transition, because the next key press may be a command of the page again.
+    """
+    with context.client.content, ui.dialog() as dialog:
+        named(dialog.props("transition-duration=0"), label)
+        with tag(ui.card().classes(classes), name):
+            yield dialog
+    dialog.on("hide", dialog.delete)
+    dialog.open()
+
+
 def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: str = "", value: str = "") -> None:
     """Ask a question in a dialog; if the button with the text ``go`` is clicked, call ``answer``, which may be async.
 
@@ -119,18 +133,14 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
         await on_page(answer)(str(field.value or "").strip() if field is not None else "")
 
     field: ui.input | None = None
-    with context.client.content, ui.dialog() as dialog:
-        named(dialog.props("transition-duration=0"), title)
-        with tag(ui.card(), "ask"):
-            ui.label(title).classes("text-lg text-bold ps-break")
-            if label:
-                field = tag(ui.input(label, value=value).props("autofocus").classes("w-full"), "ask-text")
-                on_enter(field, done)
-            with ui.row().classes("w-full justify-end"):
-                button("", words("Cancel"), dialog.close, "flat" if label else "flat autofocus")
-                button("ask-go", go, done, "unelevated" if label else "outline")
-    dialog.on("hide", dialog.delete)
-    dialog.open()
+    with open_dialog(title, "ask") as dialog:
+        ui.label(title).classes("text-lg text-bold ps-break")
+        if label:
+            field = tag(ui.input(label, value=value).props("autofocus").classes("w-full"), "ask-text")
+            on_enter(field, done)
+        with ui.row().classes("w-full justify-end"):
+            button("", words("Cancel"), dialog.close, "flat" if label else "flat autofocus")
+            button("ask-go", go, done, "unelevated" if label else "outline")
 
 
 async def change_files(

@@ -222,14 +222,9 @@ class ReviewController:
         if not self._query.get("selection"):
             self._query |= {"title": title}
         if missing := [i for i in only if i not in self.only]:
-            self.page.say(
-                self.words(
-                    "Linked recordings that are not in this data set: {n}, for example “{first}”.",
-                    n=len(missing),
-                    first=missing[0],
-                ),
-                "warning",
-            )
+            values = {"n": len(missing), "first": missing[0]}
+            text = self.words("Linked recordings that are not in this data set: {n}, for example “{first}”.", **values)
+            self.page.say(text, "warning")
 
     # Building -----------------------------------------------------------------------------------------------------
 
@@ -239,12 +234,8 @@ class ReviewController:
         with ui.row().classes("w-full items-center ps-small-gap"):
             tag(ui.label(review.dataset.head.name).classes("text-lg text-bold"), "name")
             if review.dataset.head.simulated:
-                tag(
-                    ui.label(words("Simulation: these data say nothing about a real toy.")).classes(
-                        "ps-message ps-message-warning"
-                    ),
-                    "simulation",
-                )
+                mark = ui.label(words("Simulation: these data say nothing about a real toy."))
+                tag(mark.classes("ps-message ps-message-warning"), "simulation")
             self.counts = tag(ui.label().props("role=status"), "counts")
             self.making = tag(ui.label().classes("ps-dim").props("role=status"), "making")
             ui.space()
@@ -253,15 +244,11 @@ class ReviewController:
             to_train = ui.link(words("Next: train →"), address("train", dataset=review.path)).classes("ps-link")
             tag(to_train, "to-train")
         if review.is_labelled:
-            tag(
-                ui.label(
-                    words(
-                        "These recordings are cut where the label of the rows changes, so they cannot be trimmed. "
-                        "Findings and exclusion work as usual."
-                    )
-                ).classes("ps-message ps-message-info w-full"),
-                "labelled",
+            about = words(
+                "These recordings are cut where the label of the rows changes, so they cannot be trimmed. Findings and "
+                "exclusion work as usual."
             )
+            tag(ui.label(about).classes("ps-message ps-message-info w-full"), "labelled")
         with ui.row().classes("w-full items-center ps-small-gap"):
             shown = [v for v in VIEWS if v != STREAM or self.streams]
             toggle = ui.toggle({v: words(_VIEWS[v]) for v in shown}, value=self.view)
@@ -277,12 +264,9 @@ class ReviewController:
         self._label_fold()
         if self.only is not None:
             with tag(ui.row().classes("w-full items-center ps-message ps-message-info"), "selection"):
-                ui.label(
-                    words("Only the linked recordings ({n}). {title}", n=len(self.only), title=self.title or "")
-                ).classes("flex-grow")
+                text = words("Only the linked recordings ({n}). {title}", n=len(self.only), title=self.title)
+                ui.label(text).classes("flex-grow")
                 ui.link(words("Show all"), address("review", dataset=review.path)).style("color: inherit")
-        # Out of the flow, so that it leaves no gap.
-        self.page_slot = ui.element("div").style("position: absolute")
         self.views = {name: view(self) for name, view in views.items()}
         on_change(review.changed, self.changed)
         ui.timer(_LOOK_S, self._look)

@@ -9,23 +9,12 @@ from nicegui import ui
 
 from plushsense.dataset.statistics import DurationBand, duration_bands
 from plushsense.studio.app.shell import LINES, address, button, tag
-from plushsense.studio.app.words import Texts, in_context
+from plushsense.studio.app.words import in_context
 from plushsense.studio.pages.review.controller import DURATIONS, ReviewController
 from plushsense.studio.pages.review.plot import ReviewPlot
 from plushsense.studio.pages.review.signals import GestureOverlay
 from plushsense.studio.pages.review.table_view import check_name
 from plushsense.studio.widgets.elements import link, table
-
-_HEADS: Texts = {
-    "gesture": "Gesture",
-    "n": "Number",
-    "mean": "Mean",
-    "median": "Median",
-    "sd": "Standard deviation",
-    "least": "Shortest",
-    "most": "Longest",
-    "odd": in_context("column", "Outliers"),
-}
 
 _MAX_OUTLIERS = 30
 _GREY = "#8a9099"
@@ -54,12 +43,11 @@ class GestureOverlayView:
                     words("Overlay of the recordings of one gesture"), height=420, legend=False, on_pick=self.picked
                 )
                 tag(self.plot, "overlay-plot")
-                ui.label(
-                    words(
-                        "Click a curve or a name to open the recording. Excluded recordings are left out, and trims "
-                        "are applied."
-                    )
-                ).classes("ps-dim")
+                about = words(
+                    "Click a curve or a name to open the recording. Excluded recordings are left out, and trims are "
+                    "applied."
+                )
+                ui.label(about).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
                 ui.label(words("Outliers")).classes("text-bold")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "outliers")
@@ -161,19 +149,17 @@ class DurationsView:
                     words("Durations of the recordings of one gesture"), height=380, legend=False, on_pick=self.picked
                 )
                 self.plot = tag(plot, "durations-plot")
-                ui.label(
-                    words(
-                        "The line is the mean, the shaded band the durations that differ from it by no more than the "
-                        "percentage. Click a point or a name to open the recording."
-                    )
-                ).classes("ps-dim")
+                about = words(
+                    "The line is the mean, the shaded band the durations that differ from it by no more than the "
+                    "percentage. Click a point or a name to open the recording."
+                )
+                ui.label(about).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
                 ui.label(words("Outliers")).classes("text-bold")
                 select = button("select-outliers", "", self._select, "outline")
                 self.select = select.classes("ps-act")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "duration-outliers")
-        with ui.column().classes("w-full") as self.all:
-            pass
+        self.all = ui.column().classes("w-full")
         self.all.move(self.place)
 
     def draw(self) -> None:
@@ -265,21 +251,14 @@ class DurationsView:
         for gesture, band in bands.items():
             to = address("review", dataset=desk.review.path, view=DURATIONS, gesture=gesture)
             numbers = _numbers(desk, band)
-            rows.append(
-                (
-                    link(words.gesture(gesture), to),
-                    str(len(band.seconds)),
-                    *(numbers[key] for key in ("mean", "median", "sd", "least", "most")),
-                    str(len(band.outliers)),
-                )
-            )
-        head = [words(head) for head in _HEADS.values()]
+            gesture_link, count = link(words.gesture(gesture), to), str(len(band.seconds))
+            rows.append((gesture_link, count, *numbers.values(), str(len(band.outliers))))
+        head = words.each("Gesture", "Number", "Mean", "Median", "Standard deviation", "Shortest", "Longest")
+        head.append(words(in_context("column", "Outliers")))
         self.all.clear()
         with self.all:
-            tag(
-                table(words("Durations of all gestures, in seconds"), head, rows, range(1, len(head))),
-                "durations-table",
-            )
+            caption = words("Durations of all gestures, in seconds")
+            tag(table(caption, head, rows, range(1, len(head))), "durations-table")
 
     async def picked(self, event: dict[str, Any]) -> None:
         """Open the recording whose point is nearest to the click."""

@@ -8,10 +8,10 @@ from nicegui import background_tasks, run, ui
 
 from plushsense.dataset.marks import HANDLING, PRACTICE, REST
 from plushsense.studio.app.shell import button, icon_button, tag
-from plushsense.studio.app.words import Texts
+from plushsense.studio.app.words import CHANNEL_KINDS, Texts
 from plushsense.studio.pages.review.controller import ReviewController
 from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
-from plushsense.studio.pages.review.signals import ALL, KINDS, RecordingSignals
+from plushsense.studio.pages.review.signals import ALL, RecordingSignals
 
 _LABELS: Texts = {
     "handling": "Handling",
@@ -97,19 +97,19 @@ class StreamView:
             if signals is None or stream != desk.stream:
                 return
             plotted = signals.curves(ALL, low, high)
-            lanes = [(at, words(KINDS.get(kind, kind))) for at, kind in plotted["lanes"]]
+            lanes = [(at, words(CHANNEL_KINDS.get(kind, kind))) for at, kind in plotted.lanes]
             self.plot.show(
                 stream,
                 self._about(signals),
-                plotted["x"],
-                plotted["curves"],
-                curve_styles([words.channel(n) for n in plotted["names"]]),
+                plotted.x,
+                plotted.curves,
+                curve_styles([words.channel(n) for n in plotted.names]),
                 x_title=words("Seconds since the first row of the stream"),
-                y_title=words("Value ({unit})", unit=words.unit(plotted["unit"])) if plotted["unit"] else "",
+                y_title=words("Value ({unit})", unit=words.unit(plotted.unit)) if plotted.unit else "",
                 lanes=lanes,
                 limits=(-1.08 - 2.1 * (len(lanes) - 1), 1.08) if lanes else None,
                 cut=self._shaded(signals),
-                thinned=plotted["thinned"] or low is not None,
+                thinned=plotted.thinned or low is not None,
                 keep=low is not None,
             )
             self._drawn = None
