@@ -158,16 +158,13 @@ class Page:
         self._messages.clear()
         if not sentence:
             return
-        with self._messages:
-            role = "alert" if kind == "error" else "status"
-            box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap").props(f'role="{role}"')
-            with tag(box, "message"):
-                ui.label(sentence).classes("flex-grow")
-                if undo is not None:
-                    button("undo", self.words("Undo"), on_page(undo), "outline color=inherit")
-                icon_button(
-                    "close", self.words("Close this message"), lambda: self.say(""), "flat round dense color=inherit"
-                )
+        with self._messages, tag(message_row(kind), "message"):
+            ui.label(sentence).classes("flex-grow")
+            if undo is not None:
+                button("undo", self.words("Undo"), on_page(undo), "outline color=inherit")
+            icon_button(
+                "close", self.words("Close this message"), lambda: self.say(""), "flat round dense color=inherit"
+            )
 
     @contextmanager
     def show_errors(self) -> Iterator[None]:
@@ -178,6 +175,12 @@ class Page:
             self.say(self.words.error(refusal), "error")
         except OSError as cause:
             self.say(self.words.error(refusal_of(cause)), "error")
+
+
+def message_row(kind: Kind) -> ui.row:
+    """Add a coloured box for a message, which screen readers announce."""
+    box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap")
+    return box.props(f'role="{"alert" if kind == "error" else "status"}"')
 
 
 def visitor() -> tuple[Words, bool | None]:

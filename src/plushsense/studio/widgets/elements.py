@@ -26,6 +26,7 @@ from plushsense.studio.app.shell import (
     button,
     html,
     icon_button,
+    message_row,
     named,
     on_change,
     on_page,
@@ -481,16 +482,9 @@ class WorkPanel:
                     self._bars[job.id] = (bar, tag(where, "where"))
             if last is not None:
                 bad = last.state == REFUSED
-                message = (
-                    words.failure(last.refusal)
-                    if bad
-                    else words("Stopped: {title}. Finished parts are kept.", title=title_of(words, last))
-                )
-                row = ui.row().classes(
-                    f"ps-message ps-message-{'error' if bad else 'warning'} w-full items-center no-wrap"
-                )
-                with tag(row.props(f'role="{"alert" if bad else "status"}"'), "ended"):
-                    ui.label(message).classes("flex-grow").style("overflow-wrap: anywhere")
+                stopped = words("Stopped: {title}. Finished parts are kept.", title=title_of(words, last))
+                with tag(message_row("error" if bad else "warning"), "ended"):
+                    ui.label(words.failure(last.refusal) if bad else stopped).classes("flex-grow ps-break")
                     look = "flat round dense color=inherit"
                     icon_button("close", words("Close this message"), lambda: self._close(last.id), look)
 

@@ -134,8 +134,7 @@ class Incoming:
             stored.rename(place)
             self.bundles.append(name)
         except BundleError:
-            note = Message("this is no network, or a damaged one")
-            self.refused.append(_about(stored.name, note))
+            self.refused.append(_about(stored.name, Message("this is no network, or a damaged one")))
         except ConfigError as refusal:
             self.refused.append(_about(stored.name, refusal.message))
         finally:
@@ -244,14 +243,9 @@ class IncomingSection:
             with page.show_errors():
                 if problem is not None:
                     raise problem
-                page.say(
-                    words(
-                        "The upload was cancelled. Nothing was imported."
-                        if end["cancelled"]
-                        else "The upload broke off. Nothing was imported. Try again."
-                    ),
-                    "warning",
-                )
+                cancelled = words("The upload was cancelled. Nothing was imported.")
+                broken_off = words("The upload broke off. Nothing was imported. Try again.")
+                page.say(cancelled if end["cancelled"] else broken_off, "warning")
             return
         added, incoming.bundles = incoming.bundles, []
         if added:
@@ -334,10 +328,8 @@ class IncomingSection:
         gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
         folded_lines(words, words("Gestures: {n}", n=len(gestures)), gestures, "preview_gestures")
         notes = [words.sentence(n) for n in result["notes"] if not _is_of_preview(n)]
-        if result["flagged"]:
-            notes.append(
-                words("Recordings with something to look at: {n}. The page Review shows them.", n=result["flagged"])
-            )
+        if n := result["flagged"]:
+            notes.append(words("Recordings with something to look at: {n}. The page Review shows them.", n=n))
         for note in notes:
             ui.label(note).classes("ps-note ps-break")
         rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result["rejected"]]
@@ -368,10 +360,8 @@ class IncomingSection:
             layout.error = words("It is not clear which sensors these files are from. Choose them.")
         if unknown_person or self._person:
             with ui.row().classes("items-start ps-small-gap w-full"):
-                person = tag(
-                    ui.input(words("Code of the person (such as S01)"), value=self._person).classes("ps-wide"),
-                    "person-of-files",
-                )
+                person = ui.input(words("Code of the person (such as S01)"), value=self._person).classes("ps-wide")
+                tag(person, "person-of-files")
                 person.on("keydown.enter", on_page(change_person))
                 button("person-use", words("Use this code"), on_page(change_person))
             if unknown_person:
@@ -381,19 +371,16 @@ class IncomingSection:
         words, workspace = self._words, self._page.workspace
         plain = plain_name(result["name"] or self._incoming.name, words("recordings"))
         free = workspace.free_name(DATASETS, plain, separator=" ")
-        name = tag(
-            ui.input(words("Name of the new data set"), value=free).props("maxlength=64").classes("w-full"),
-            "incoming-name",
-        )
+        name = ui.input(words("Name of the new data set"), value=free).props("maxlength=64")
+        tag(name.classes("w-full"), "incoming-name")
 
         async def keep() -> None:
             with errors_beside(self._page, name):
                 place = await run.io_bound(self._incoming.keep, str(name.value or ""))
                 if place is not None:
                     self._reset()
-                    self._page.say(
-                        words("The data set “{name}” is there. Review its recordings next.", name=place.name), "good"
-                    )
+                    there = words("The data set “{name}” is there. Review its recordings next.", name=place.name)
+                    self._page.say(there, "good")
                     await self._refresh()
 
         with ui.row().classes("ps-small-gap"):

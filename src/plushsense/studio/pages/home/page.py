@@ -93,12 +93,11 @@ def invitation(page: Page) -> None:
         return
     words = page.words
     with titled_card(page, "Connect another device", "invite"):
-        ui.label(
-            words(
-                "A tablet or another computer needs its own address, which can be opened once. Scan the code with "
-                "its camera, or type the address."
-            )
-        ).classes("ps-dim")
+        about = words(
+            "A tablet or another computer needs its own address, which can be opened once. Scan the code with its "
+            "camera, or type the address."
+        )
+        ui.label(about).classes("ps-dim")
         place = ui.column().classes("w-full").props('aria-live="polite"')
 
         def show() -> None:
@@ -118,18 +117,7 @@ def invitation(page: Page) -> None:
 
 
 MAKING = ("simulate", "import", "restore")
-CHANGING = (
-    *MAKING,
-    "backup",
-    "restore",
-    "forget",
-    "check",
-    "train",
-    "sweep",
-    "search",
-    "export",
-    "publish",
-)
+CHANGING = (*MAKING, "backup", "forget", "check", "train", "sweep", "search", "export", "publish")
 # Enough data to train a network, but simulated within seconds.
 _PEOPLE, _REPETITIONS = 6, 2
 
@@ -155,11 +143,8 @@ async def show(page: Page) -> None:
             invitation(page)
 
     def fill(now: WorkspaceSummary) -> None:
-        step.fill(now)
-        datasets.fill(now)
-        sessions.fill(now)
-        networks(now)
-        discarded.fill(now.discarded)
+        for part in (step.fill, datasets.fill, sessions.fill, networks, discarded.fill):
+            part(now)
 
     async def refresh() -> None:
         now = await run.io_bound(overview.look)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -122,13 +122,13 @@ class DiscardedSection:
             summary(page.words("Discarded"))
             self._rows = ui.column().classes("w-full ps-small-gap")
 
-    def fill(self, paths: Sequence[Path]) -> None:
+    def fill(self, contents: WorkspaceSummary) -> None:
         """Replace the displayed files."""
         words, workspace = self._page.words, self._page.workspace
         self._rows.clear()
-        self._box.set_visibility(bool(paths))
+        self._box.set_visibility(bool(contents.discarded))
         with self._rows:
-            for path in paths:
+            for path in contents.discarded:
                 kind, _, name = path.relative_to(workspace.folder / DISCARDED).as_posix().partition("/")
                 self._row(path, f"{words(_KINDS[kind])}: {name}", name)
 
@@ -142,12 +142,8 @@ class DiscardedSection:
             await change(lambda: workspace.delete(path), words("“{name}” is deleted.", name=name))
 
         def ask_delete() -> None:
-            ask(
-                words,
-                words("Delete “{name}” for good? This cannot be undone.", name=name),
-                words("Delete for good"),
-                delete,
-            )
+            title = words("Delete “{name}” for good? This cannot be undone.", name=name)
+            ask(words, title, words("Delete for good"), delete)
 
         with ui.row().classes("ps-row items-center w-full ps-small-gap"):
             ui.label(text).classes("flex-grow ps-break")
@@ -340,9 +336,10 @@ class JobList:
             link = ui.link(words("Download"), download_address(BACKUPS, place.stem)).classes("ps-link")
             tag(link.props("download"), "download")
         if job.task == "forget":
-            ui.label(
-                words("The person is removed, with {n} files. Delete what remains elsewhere, too.", n=result["files"])
+            removed = words(
+                "The person is removed, with {n} files. Delete what remains elsewhere, too.", n=result["files"]
             )
+            ui.label(removed)
         if job.task in ("import", "simulate", "restore"):
             people = result.get("subjects", result.get("people", 0))
             facts = [words("recordings: {n}", n=result["recordings"]), words("people: {n}", n=people)]
@@ -350,10 +347,8 @@ class JobList:
                 facts.append(words("new: {n}", n=result["added"]["recordings"]))
             ui.label(" · ".join(facts))
         warnings = [words.sentence(w) for w in (*job.warnings, *result.get("warnings", ()))]
-        if result.get("flagged"):
-            warnings.append(
-                words("Recordings with something to look at: {n}. The page Review shows them.", n=result["flagged"])
-            )
+        if n := result.get("flagged"):
+            warnings.append(words("Recordings with something to look at: {n}. The page Review shows them.", n=n))
         rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result.get("rejected", ())]
         folded_lines(words, words("Warnings: {n}", n=len(warnings)), warnings)
         folded_lines(words, words("Files that are not imported: {n}", n=len(rejected)), rejected)

@@ -6,7 +6,7 @@ from nicegui import ui
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Message
-from plushsense.studio.app.shell import Page, button, on_change, on_page, tag
+from plushsense.studio.app.shell import Kind, Page, button, message_row, on_change, on_page, tag
 from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, with_layout
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.home.sections import SMALL, simulation_badge, titled_card
@@ -41,10 +41,8 @@ class ToySection:
                 button("virtual", text, lambda: self._choose(f"virtual://?person={who.value}"), "unelevated")
             self._others = ui.column().classes("w-full ps-small-gap")
             with ui.row().classes("items-start ps-small-gap w-full"):
-                field = ui.input(words("Address of another toy"), placeholder="tcp://192.168.1.20:3333").classes(
-                    "ps-wide"
-                )
-                self._address = tag(field, "address")
+                field = ui.input(words("Address of another toy"), placeholder="tcp://192.168.1.20:3333")
+                self._address = tag(field.classes("ps-wide"), "address")
                 field.on("keydown.enter", self._use)
                 button("use", words("Use this toy"), self._use)
         self._update()
@@ -89,8 +87,7 @@ class ToySection:
                     simulation_badge(self._page)
             if trial is not None:
                 kind, text = self._describe(trial)
-                box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap")
-                with tag(box.props('role="status"'), "trial"):
+                with tag(message_row(kind), "trial"):
                     if trial.running:
                         ui.spinner(size="1.2em", color="inherit").props("aria-hidden=true")
                     ui.label(text).classes("ps-break")
@@ -99,11 +96,10 @@ class ToySection:
                     fitting, url = trial.layout, with_layout(trial.url, trial.layout)
                     text = words("Use the sensors of {layout}", layout=fitting)
                     button("use-layout", text, on_page(lambda: self._choose(url)), "unelevated")
-                button("test", words("Test the toy"), on_page(self._try_out)).set_enabled(
-                    trial is None or not trial.running
-                )
+                test = button("test", words("Test the toy"), on_page(self._try_out))
+                test.set_enabled(trial is None or not trial.running)
 
-    def _describe(self, trial: ToyTrial) -> tuple[str, str]:
+    def _describe(self, trial: ToyTrial) -> tuple[Kind, str]:
         """Return the kind of message and the sentence about a trial."""
         words, result = self._words, trial.result
         if trial.running:
@@ -145,9 +141,8 @@ class ToySection:
             for note in toys.listing.notes:
                 ui.label(words.sentence(note)).classes("ps-dim ps-note ps-break")
             button("look", words("Look again" if toys.searched else "Look for toys"), toys.search, SMALL)
-            ui.label(
-                words(
-                    "Only serial ports are searched when this page opens. The button also searches by Bluetooth, and "
-                    "asks the network for LSL streams."
-                )
-            ).classes("ps-dim ps-note")
+            about = words(
+                "Only serial ports are searched when this page opens. The button also searches by Bluetooth, and asks "
+                "the network for LSL streams."
+            )
+            ui.label(about).classes("ps-dim ps-note")

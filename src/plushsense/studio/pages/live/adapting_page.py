@@ -48,10 +48,8 @@ class PersonFields:
 
     def add(self, name: str, on_change: Callable[[], None] = lambda: None) -> ui.input:
         """Add a field; ``on_change`` is called when the text of any field has changed."""
-        words = self._page.words
-        field = tag(
-            ui.input(words("Code of the person"), value=self.code, placeholder="S01").props("maxlength=16"), name
-        )
+        field = ui.input(self._page.words("Code of the person"), value=self.code, placeholder="S01")
+        tag(field.props("maxlength=16"), name)
         self._fields.append(field)
 
         def changed() -> None:
@@ -74,13 +72,10 @@ class PersonFields:
         try:
             text = check_subject(self.code)
         except BadInput as refusal:
-            field.error = (
-                self._page.words.error(refusal)
-                if self.code
-                else self._page.words(
-                    "First enter the code of the person who touches the toy, for example S01 and never a name."
-                )
+            missing = self._page.words(
+                "First enter the code of the person who touches the toy, for example S01 and never a name."
             )
+            field.error = self._page.words.error(refusal) if self.code else missing
             field.run_method("focus")
         return text
 
@@ -96,10 +91,8 @@ class _AdaptingPanel:
         ui.label(words("Adapt the network to a person")).classes("text-bold")
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._person = people.add("adapt-person", self._update).style("flex: 1 1 9rem")
-            self._recordings = ui.select({}, label=words("Recordings of the person")).style(
-                "flex: 1 1 15rem; min-width: 0"
-            )
-            tag(self._recordings, "adapt-from")
+            self._recordings = tag(ui.select({}, label=words("Recordings of the person")), "adapt-from")
+            self._recordings.style("flex: 1 1 15rem; min-width: 0")
             self._adapt = button("adapt", words("Adapt to these recordings"), self._run, icon="auto_fix_high")
         # Messages are displayed here, because the top of the page may be out of view.
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))

@@ -252,13 +252,8 @@ def _situation(situation: Situation) -> FeedMessage:
     return {**vars(situation), "confidence": sure}
 
 
-def _performed(performed: Performed) -> FeedMessage:
-    return {
-        "id": performed.number,
-        "from": round(performed.begin_s, 2),
-        "to": round(performed.end_s, 2),
-        "label": performed.label,
-    }
+def _performed(made: Performed) -> FeedMessage:
+    return {"id": made.number, "from": round(made.begin_s, 2), "to": round(made.end_s, 2), "label": made.label}
 
 
 def _span(span: EventSpan) -> FeedMessage:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +24,11 @@ from plushsense.studio.pages.live.log import LogButtons
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
 from plushsense.studio.pages.live.state import LiveChoice
-from plushsense.studio.widgets.elements import style, summary
+from plushsense.studio.widgets.elements import notice, style, summary
 
 _REACTIONS: Texts = {
     "standard": "green, or red if rough",
     "gentle": "green, or dark if rough",
-}
-
-_RATES: Texts = {
-    "decision": "Show the decision",
-    "plot": "Draw the signals",
 }
 
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
@@ -46,12 +42,7 @@ def show(page: Page) -> None:
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
         _Controls(page, reader, feed)
-    simulated = tag(
-        ui.label(words("Simulation: these data say nothing about a real toy.")).classes(
-            "ps-message ps-message-warning w-full"
-        ),
-        "simulation",
-    )
+    simulated = tag(notice(words("Simulation: these data say nothing about a real toy.")), "simulation")
 
     def update_mark() -> None:
         simulated.set_visibility(reader.device is not None and reader.choice.simulated)
@@ -97,9 +88,8 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
         buttons.clear()
         with buttons:
             for label in now:
-                button(
-                    f"do-{label}", words.gesture(label), lambda label=label: direct(label), 'outline padding="3px 8px"'
-                ).classes("ps-note")
+                make, look = partial(direct, label), 'outline padding="3px 8px"'
+                button(f"do-{label}", words.gesture(label), make, look).classes("ps-note")
             button("do-nothing", words("Stop"), lambda: direct(""), "outline dense", icon="stop").classes("ps-note")
             button("do-own", words("By themselves"), lambda: direct(None), "flat dense").classes("ps-note")
 
@@ -136,8 +126,8 @@ class _Controls:
                 tag(self._reactions, "reactions")
                 engines = {"float": words("as trained (float)"), "int8": words("as on the chip (int8)")}
                 self._engine = tag(ui.select(engines, value=choice.engine, label=words("Arithmetic")), "engine")
-                self._add_rate("decision", RATES_HZ[-1], lambda pace_s: setattr(feed, "decision_s", pace_s))
-                self._add_rate("plot", PLOT_HZ, lambda pace_s: setattr(feed, "plot_s", pace_s))
+                self._add_rate("decision", words("Show the decision"), RATES_HZ[-1])
+                self._add_rate("plot", words("Draw the signals"), PLOT_HZ)
             self._rates = ui.label("").classes("ps-dim ps-note")
             with ui.row().classes("w-full items-center ps-small-gap"):
                 self._look = button("look", words("Look for toys"), self._toys.search, "flat", icon="search")
@@ -158,13 +148,16 @@ class _Controls:
         self._toy = ui.select(options, value=first, label=label, with_input=True, new_value_mode="add-unique")
         tag(self._toy.props(f'hint="{self._page.words("Choose, or type an address and press Enter")}"'), "toy")
 
-    def _add_rate(self, name: str, usual: int, choose: Callable[[float], None]) -> None:
+    def _add_rate(self, name: str, label: str, usual: int) -> None:
         """Add the choice of a rate at which this page displays something; ``usual`` is chosen at first."""
-        words = self._page.words
-        most = RATES_HZ[-1]
+        words, most = self._page.words, RATES_HZ[-1]
         rates = {n: words("{n} times a second", n=n) if n > 1 else words("once a second") for n in RATES_HZ[::-1]}
-        field = ui.select(rates, value=usual, label=words(_RATES[name]))
-        tag(field, f"rate-{name}").on_value_change(lambda e: choose(PACE_S if e.value == most else 1.0 / e.value))
+
+        def choose(rate: int) -> None:
+            setattr(self._feed, f"{name}_s", PACE_S if rate == most else 1.0 / rate)
+
+        field = ui.select(rates, value=usual, label=label)
+        tag(field, f"rate-{name}").on_value_change(lambda e: choose(e.value))
 
     async def _run(self, command: Callable[..., None], *args: Any) -> bool:
         """Run ``command`` in a thread, show its errors beside the field, and return whether it succeeded."""
@@ -239,13 +232,12 @@ class _Controls:
         now = f": {choice.toy} · {choice.bundle.stem}" if running and choice.bundle is not None else ""
         self._title.set_content(words("Toy, network and settings") + now)
         step_s = reader.bundle.arch.step * reader.bundle.layout.period_us / 1e6 if reader.bundle is not None else 0.05
-        self._rates.set_text(
-            words(
-                "These two change only this page. The network itself answers {n} times a second, and neither events "
-                "nor reactions wait for the page.",
-                n=words.number(1.0 / step_s),
-            )
+        rates = words(
+            "These two change only this page. The network itself answers {n} times a second, and neither events nor "
+            "reactions wait for the page.",
+            n=words.number(1.0 / step_s),
         )
+        self._rates.set_text(rates)
         self._follow()
 
     def _update_toys(self) -> None:

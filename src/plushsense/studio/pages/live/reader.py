@@ -92,9 +92,7 @@ class LiveReader:
             ConfigError, DeviceError, BundleError: if the toy or bundle cannot be opened, or they do not fit each other.
         """
         with self._changing:
-            if choice.bundle is None:
-                raise _no_bundle()
-            bundle = _load(self._workspace.inside(choice.bundle))
+            bundle = _load(self._workspace, choice.bundle)
             classifier = _classifier(bundle, choice.engine)
             reactor = _reactor(choice.reactions, bundle)
             url = with_speed(choice.toy, self._workspace.speed)
@@ -113,13 +111,8 @@ class LiveReader:
                 self._first, self._performed, self._malformed = self._begun + 1, [], 0
                 self._started = time.time()
                 self.device, self.bundle, self._next = device, bundle, bundle_run
-                self.now = LiveState(
-                    self.now.generation + 1,
-                    running=True,
-                    connection="connecting",
-                    state="warming",
-                    changes=self._changes,
-                )
+                fresh = LiveState(self.now.generation + 1, True, connection="connecting", state="warming")
+                self.now = replace(fresh, changes=self._changes)
             self._ends = threading.Event()
             self._thread = threading.Thread(
                 target=self._read, args=(device, self._ends), name="plushsense-live", daemon=True
@@ -141,11 +134,9 @@ class LiveReader:
                 self.choice = replace(self.choice, bundle=bundle, engine=engine, reactions=reactions)
                 self.changed.notify()
                 return
-            if bundle is None:
-                raise _no_bundle()
             fresh = before
             if bundle != self.choice.bundle:
-                fresh = _load(self._workspace.inside(bundle))
+                fresh = _load(self._workspace, bundle)
                 _refuse_strange(fresh, before)
             reactor = _reactor(reactions, fresh)
             bundle_run = _BundleRun(fresh, run_on(device, _classifier(fresh, engine), warn=_kept), reactor)
@@ -185,7 +176,8 @@ class LiveReader:
             person.follow()
             if label:
                 person.perform(label)
-        self._set(next_gesture=label or "")
+        with self._lock:
+            self.now = replace(self.now, next_gesture=label or "")
         self.changed.notify()
 
     def close(self) -> None:
@@ -279,16 +271,8 @@ class LiveReader:
         with self._lock:
             if self.device is device:
                 self._end_event(self.now.t_s)
-                self.now = replace(
-                    self.now,
-                    running=False,
-                    ended=None if ends.is_set() else ended,
-                    connection="",
-                    state="",
-                    probabilities=None,
-                    reaction=None,
-                    next_gesture="",
-                )
+                still = replace(self.now, running=False, ended=None if ends.is_set() else ended, next_gesture="")
+                self.now = replace(still, connection="", state="", probabilities=None, reaction=None)
         self.changed.notify()
 
     def _poll(self, device: TappedDevice, bundle_run: _BundleRun) -> None:
@@ -430,23 +414,13 @@ class LiveReader:
         longest = max(overlaps, default=0.0)
         return overlaps[longest] if longest > 0.0 else ""
 
-    def _set(self, **changed: Any) -> None:
-        with self._lock:
-            self.now = replace(self.now, **changed)
-
     def _swap(self, fresh: _BundleRun) -> None:
         """Continue with another bundle, and end the current event."""
         with self._lock:
             self._end_event(self.now.t_s)
             self.bundle = fresh.bundle
-            self.now = replace(
-                self.now,
-                generation=self.now.generation + 1,
-                state="warming",
-                answer=None,
-                probabilities=None,
-                reaction=None,
-            )
+            self.now = replace(self.now, state="warming", answer=None, probabilities=None, reaction=None)
+            self.now = replace(self.now, generation=self.now.generation + 1)
         self.changed.notify()
 
     def _end_event(self, t_s: float) -> None:
@@ -458,10 +432,6 @@ class LiveReader:
 
 def _kept(_: str) -> None:
     """Leave a warning to `LiveRun.warnings`, which the pages show."""
-
-
-def _no_bundle() -> ConfigError:
-    return ConfigError("No network is chosen. Choose one, or train one first.", field="network")
 
 
 def _virtual(device: TappedDevice) -> VirtualDevice | None:
@@ -481,10 +451,12 @@ def _simulated(url: str) -> bool:
     return head.simulated if head is not None else is_simulation(place, [])
 
 
-def _load(path: Path) -> Bundle:
+def _load(workspace: Workspace, path: Path | None) -> Bundle:
     """Read a bundle; an error has a message of the studio's own."""
+    if path is None:
+        raise ConfigError("No network is chosen. Choose one, or train one first.", field="network")
     try:
-        return Bundle.load(path)
+        return Bundle.load(workspace.inside(path))
     except BundleError as cause:
         raise BundleError(
             "The network {name} cannot be read: the file is missing or damaged, or another version wrote it. Choose "
