@@ -20,6 +20,7 @@ from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import (
     DEFAULT_LAYOUT,
     SCAN_S,
+    DeviceInfo,
     DeviceListing,
     check_address,
     is_virtual,
@@ -30,6 +31,7 @@ from plushsense.devices.opening import (
     with_speed,
 )
 from plushsense.devices.reconnect import ConnectionGap
+from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.windows.clock import SampleClock
 
@@ -244,6 +246,17 @@ class ToyTrial:
     result: ConnectionTest | None = None
     error: Exception | None = None
     layout: str = ""
+
+
+def toy_title(words: Words, url: str) -> str:
+    """Return the text for a toy in a list: its URL, marked if the toy is virtual."""
+    return f"{words('Virtual toy (simulation)')} · {url}" if is_virtual(url) else url
+
+
+def described(words: Words, toy: DeviceInfo) -> str:
+    """Return the description of a toy that was found; that of a serial port is the text of the system."""
+    about = toy.description
+    return words.sentence(about) if isinstance(about, Message) else about
 
 
 def with_layout(url: str, layout: str) -> str:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from nicegui import ui
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.sentences import Message
 from plushsense.studio.app.shell import Kind, Page, button, message_row, on_change, on_page, tag
-from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, with_layout
+from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, described, with_layout
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.home.sections import SMALL, simulation_badge, titled_card
 from plushsense.studio.widgets.elements import errors_beside
@@ -122,8 +121,7 @@ class ToySection:
         self._others.clear()
         given = [(url, "", words("given when the studio was started")) for url in self._page.workspace.devices]
         found = [d for d in toys.listing.devices if d.kind != "virtual"]
-        # The description of a serial port is that of the system.
-        listed = [(d.url, d.name, words.sentence(a) if isinstance(a := d.description, Message) else a) for d in found]
+        listed = [(d.url, d.name, described(words, d)) for d in found]
         with self._others:
             for url, name, about in [*given, *listed]:
                 with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):

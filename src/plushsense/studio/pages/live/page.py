@@ -15,9 +15,9 @@ from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
 from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
-from plushsense.studio.app.toys import Toys
+from plushsense.studio.app.toys import Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
-from plushsense.studio.app.workspace import VIRTUAL, Workspace
+from plushsense.studio.app.workspace import VIRTUAL
 from plushsense.studio.pages.live import adapting_page, validation_page
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.log import LogButtons
@@ -144,8 +144,9 @@ class _Controls:
     def _add_toy(self, label: str) -> None:
         reader, workspace = self._reader, self._workspace
         first = reader.choice.toy if reader.now.running else workspace.toy or VIRTUAL
-        options = _toy_options(self._toys, workspace, first)
-        self._toy = ui.select(options, value=first, label=label, with_input=True, new_value_mode="add-unique")
+        self._toy = ui.select(
+            self._toy_options(first), value=first, label=label, with_input=True, new_value_mode="add-unique"
+        )
         tag(self._toy.props(f'hint="{self._page.words("Choose, or type an address and press Enter")}"'), "toy")
 
     def _add_rate(self, name: str, label: str, usual: int) -> None:
@@ -212,7 +213,7 @@ class _Controls:
         self._engine.set_value(now.engine)
         self._reactions.set_value(now.reactions)
         if self._reader.now.running:
-            self._toy.set_options(_toy_options(self._toys, self._workspace, now.toy), value=now.toy)
+            self._toy.set_options(self._toy_options(now.toy), value=now.toy)
             self._simulated.set_value(now.simulated)
 
     def _update(self) -> None:
@@ -244,7 +245,7 @@ class _Controls:
         self._busy.set_visibility(self._toys.searching)
         if not self._reader.now.running:
             value = self._toy.value
-            self._toy.set_options(_toy_options(self._toys, self._workspace, str(value or "")), value=value)
+            self._toy.set_options(self._toy_options(str(value or "")), value=value)
 
     def _update_simulated(self) -> None:
         self._toy.error = None
@@ -252,8 +253,9 @@ class _Controls:
             with contextlib.suppress(PlushSenseError):
                 self._simulated.set_value(is_virtual(str(self._toy.value or "")))
 
-
-def _toy_options(toys: Toys, workspace: Workspace, url: str) -> dict[str, str]:
-    """Return the toys to choose from (URL to text): ``url``, those given at start, the virtual one and those found."""
-    known = {one: one for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
-    return known | {d.url: f"{d.name or d.url}: {d.description}" for d in toys.listing.devices}
+    def _toy_options(self, url: str) -> dict[str, str]:
+        """Return the toys to choose from: ``url``, those given at start, the virtual one and those found."""
+        words, workspace = self._page.words, self._workspace
+        known = {one: toy_title(words, one) for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
+        found = [d for d in self._toys.listing.devices if d.kind != "virtual"]
+        return known | {d.url: f"{d.name or d.url}: {described(words, d)}" for d in found}

@@ -15,9 +15,10 @@ from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.request import PROTOCOL, SessionRequest
 from plushsense.recording.session import SessionSummary
 from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
+from plushsense.studio.app.toys import toy_title
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import CHILD, show_child
-from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice, toy_name
+from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session import collect, show_session
 from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
@@ -138,7 +139,7 @@ class _SessionLists:
                 return
             self._describe(session)
             toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
-            titles = {u: toy_name(words, u) for u in toys}
+            titles = {u: toy_title(words, u) for u in toys}
             toy = ui.select(titles, value=toys[0], label=words("Toy")).style("width: 24rem; max-width: 100%")
             named(toy.props("outlined dense"), f"{words('Toy')}: {name}")
             go_on = button("", words("Continue"), None, "unelevated", about=name)
