@@ -27,7 +27,6 @@ from plushsense.studio.pages.train.results import (
     StoredResults,
     counted,
     figure,
-    whole,
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits, of_ten, people_table
 
@@ -163,7 +162,7 @@ def test_a_verdict_names_its_limits(home: Path) -> None:
     assert latvian[0].startswith("Pārbaudē piedalījās 21 cilvēks.") and "vēl 2 cilvēkiem" in latvian[1]
     assert [counted(w, "folds", n) for n in (1, 2)] == ["1 fold", "2 folds"]
     assert [counted(Words("lv"), "folds", n) for n in (1, 2, 11, 21)] == ["1 daļa", "2 daļas", "11 daļas", "21 daļa"]
-    assert (whole(w, 7118), whole(Words("lv"), 7118)) == ("7,118", "7\u00a0118")
+    assert (w.count(7118), Words("lv").count(7118)) == ("7,118", "7\u00a0118")
 
 
 def test_the_worst_confusions_come_first() -> None:

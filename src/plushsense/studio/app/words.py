@@ -123,6 +123,10 @@ class Words:
         """Return the name of a sensor channel in this language, or ``name`` itself if it has none."""
         return self(in_context("channel", name))
 
+    def check(self, name: str) -> str:
+        """Return the name of a quality check in this language."""
+        return self(in_context("check", name.replace("-", " ")))
+
     def sentence(self, message: str | Mapping[str, Any]) -> str:
         """Return a `Message` of the library, or its JSON, in this language.
 

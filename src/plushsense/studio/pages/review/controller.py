@@ -19,7 +19,6 @@ from plushsense.dataset.quality.findings import SEVERITIES
 from plushsense.studio.app.shell import Page, address, button, on_change, set_address, tag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.review.review import (
-    CHECK_NAMES,
     EXCLUDED,
     LABELLED,
     LOOKING,
@@ -285,7 +284,7 @@ class ReviewController:
                 **{s: words(_SEVERITIES[s]) for s in SEVERITIES},
                 NO_FINDING: words("no finding"),
             },
-            "check": {c: words(CHECK_NAMES.get(c, c)) for c in CHECKS if "recording" in CHECKS[c].scope},
+            "check": {c: words.check(c) for c in CHECKS if "recording" in CHECKS[c].scope},
         }
         self._fields: dict[str, Any] = {}
         for key, choices in options.items():

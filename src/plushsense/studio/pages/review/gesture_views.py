@@ -13,7 +13,6 @@ from plushsense.studio.app.words import in_context
 from plushsense.studio.pages.review.controller import DURATIONS, ReviewController
 from plushsense.studio.pages.review.plot import ReviewPlot
 from plushsense.studio.pages.review.signals import GestureOverlay
-from plushsense.studio.pages.review.table_view import check_name
 from plushsense.studio.widgets.elements import link, table
 
 _MAX_OUTLIERS = 30
@@ -108,7 +107,7 @@ class GestureOverlayView:
                 with ui.row().classes("items-center no-wrap w-full"):
                     dash = ui.element("span").classes("ps-dash").style("width: 22px; height: 4px; flex: none")
                     dash.style(f"background: {colours[c.recording]}")
-                    text = f"{c.recording}: {', '.join(check_name(words, check) for check in c.why.split(', '))}"
+                    text = f"{c.recording}: {', '.join(words.check(check) for check in c.why.split(', '))}"
                     name = button("", text, lambda c=c: desk.open(c.recording), "flat dense align=left")
                     name.style("overflow-wrap: anywhere; text-align: left").classes("flex-grow")
             if len(outliers) > _MAX_OUTLIERS:

@@ -15,7 +15,6 @@ from plushsense.studio.pages.review.review import STATE_TEXTS
 from plushsense.studio.pages.review.signals import ACTIVITY, ALL
 from plushsense.studio.pages.review.table_view import (
     SIGNS,
-    advice,
     ask_gesture,
     ask_reason,
     finding_button,
@@ -276,7 +275,7 @@ class RecordingView:
                     ui.label(finding_text(words, f)).classes("text-bold")
                     ui.label(words.sentence(f.message))
                     with ui.row().classes("items-center") if f.accepted else contextlib.nullcontext():
-                        what = f"✓ {words('accepted as harmless')}" if f.accepted else f"→ {advice(words, f)}"
+                        what = f"✓ {words('accepted as harmless')}" if f.accepted else f"→ {words(f.action)}"
                         ui.label(what).classes("ps-dim")
                         finding_button(desk, f, row.id).classes("ps-act")
 

@@ -61,42 +61,6 @@ STATE_TEXTS: Texts = {
 }
 """Names of the states of a recording, and of the filters on them."""
 
-CHECK_NAMES: Texts = {
-    "never-stopped": "never stopped",
-    "too-short": "too short",
-    "duration": "duration",
-    "no-onset": "no start",
-    "several-gestures": "several gestures",
-    "clock-still": "clock stands still",
-    "clock-reset": "clock reset",
-    "clock-value": "wrong clock values",
-    "out-of-order": "rows out of order",
-    "gaps": "gaps",
-    "lost-frames": "lost frames",
-    "rate": "frame rate",
-    "jitter": "uneven clock",
-    "resumed": "resumed stream",
-    "cut-line": "cut line",
-    "malformed": "malformed lines",
-    "rows": "number of rows",
-    "garbage": "invalid values",
-    "blank-rows": "blank rows",
-    "spikes": "spikes",
-    "flat": "constant channel",
-    "zeroed": "constant zero",
-    "stuck": "stuck channel",
-    "saturated": "saturated channel",
-    "drift": "drift",
-    "duplicate": "duplicate",
-    "overlap": "overlap",
-    "not-in-stream": "not in the stream",
-    "missing": "missing recordings",
-    "label": "unknown label",
-    "class-balance": "balance of gestures",
-    "subject-balance": "balance of people",
-}
-"""Names of the checks."""
-
 LOOKING, NONE, SUGGESTED, DRAFT = "looking", "none", "suggested", "draft"
 ACCEPTED, ADJUSTED, EXCLUDED, LABELLED = "accepted", "adjusted", "excluded", "labelled"
 STATES = (LOOKING, SUGGESTED, NONE, DRAFT, ACCEPTED, ADJUSTED, EXCLUDED, LABELLED)

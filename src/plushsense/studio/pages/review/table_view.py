@@ -12,7 +12,7 @@ from plushsense.dataset.quality.findings import Finding
 from plushsense.studio.app.shell import AFFECT_SIGNS, button, icon_button, scroll_region, tag
 from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.pages.review.controller import SORTS, ReviewController
-from plushsense.studio.pages.review.review import CHECK_NAMES, STATE_TEXTS, ReviewedRecording
+from plushsense.studio.pages.review.review import STATE_TEXTS, ReviewedRecording
 from plushsense.studio.widgets.elements import on_enter, open_dialog
 
 _HEADS: Texts = {
@@ -29,43 +29,6 @@ _SEVERITIES: Texts = {
     "error": "to decide",
     "warning": "to look at",
     "info": "good to know",
-}
-
-ADVICE: Texts = {
-    "never-stopped": "Trim it to the gesture, or exclude it.",
-    "too-short": "Exclude it, or record it again.",
-    "duration": "Look at its plot; trim or exclude it, or accept the finding.",
-    "no-onset": "Look whether the gesture was made; exclude it if not.",
-    "several-gestures": "Trim it to one gesture, or exclude it.",
-    "clock-still": "Export the file again with all digits of its times, and import it again.",
-    "clock-reset": "Trim it to one side of the reset, or exclude it.",
-    "clock-value": "Check the cable: reading leaves out each such row.",
-    "out-of-order": "Check the radio: reading leaves out a single such row, and starts anew at several.",
-    "gaps": "Exclude it if the gesture is hit, or accept the finding.",
-    "lost-frames": "Check cable and radio; exclude it if the gesture is hit.",
-    "rate": "Check firmware and layout; training resamples it.",
-    "jitter": "Nothing to do: the clock is evened out.",
-    "resumed": "Nothing to do: reading starts anew there.",
-    "cut-line": "Nothing to do: that line is left out.",
-    "malformed": "Nothing to do: these lines are left out.",
-    "rows": "Compare it with the original file, or accept the finding.",
-    "garbage": "Check the sensor; exclude it if the gesture is hit.",
-    "blank-rows": "Check the sensor; exclude it if the gesture is hit.",
-    "spikes": "Check the sensor; exclude it if the gesture is hit.",
-    "flat": "Check the sensor's cable; exclude what it spoiled.",
-    "zeroed": "The values are lost; record again.",
-    "stuck": "Check the sensor; exclude it if the gesture is hit.",
-    "saturated": "Widen the sensor's range, or accept strong touch.",
-    "drift": "Let the toy calibrate again between gestures.",
-    "duplicate": "Exclude one of the two.",
-    "overlap": "Trim or exclude one of the two.",
-    "not-in-stream": "Check that the stream is that of this session.",
-    "missing": "Record them if the person is still there, or accept the finding.",
-    "label": "Set another gesture for these recordings, or import them with a gesture set that has the label.",
-    "class-balance": "Weight the gestures in training, or leave odd ones out.",
-    "subject-balance": "Record more people or recordings.",
-    "clock-reset-stream": "Nothing to do: reading starts anew there.",
-    "gaps-stream": "Nothing to do: reading starts anew there.",
 }
 
 
@@ -115,18 +78,7 @@ SEVERITY_SIGNS = {"error": "✖", "warning": "▲", "info": "ℹ"}
 def finding_text(words: Words, finding: Finding) -> str:
     """Return a short text for a finding: its sign, severity and check."""
     severity = words(_SEVERITIES[finding.severity])
-    return f"{SEVERITY_SIGNS[finding.severity]} {severity}: {check_name(words, finding.check)}"
-
-
-def check_name(words: Words, check: str) -> str:
-    """Return the name of a check in this language."""
-    return words(CHECK_NAMES.get(check, check))
-
-
-def advice(words: Words, finding: Finding) -> str:
-    """Return what a check advises to do about a finding, in this language."""
-    of_stream = ADVICE.get(f"{finding.check}-stream") if finding.stream else None
-    return words(of_stream or ADVICE.get(finding.check, finding.action))
+    return f"{SEVERITY_SIGNS[finding.severity]} {severity}: {words.check(finding.check)}"
 
 
 def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
@@ -169,7 +121,7 @@ def ask_reason(
         title = words("Why is {id} excluded?", id=recording)
     else:
         about = finding.about or desk.review.dataset.head.name
-        title = words("Why is “{check}” harmless in {about}?", check=check_name(words, finding.check), about=about)
+        title = words("Why is “{check}” harmless in {about}?", check=words.check(finding.check), about=about)
 
     async def answer(why: str) -> None:
         if not why.strip():
