@@ -133,24 +133,6 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
     assert browser.complaints == []
 
 
-@pytest.mark.parametrize(
-    ("language", "dark", "size"),
-    [("lv", False, TABLET), ("lv", True, TABLET), ("en", True, DESK)],
-    ids=["lv-light-tablet", "lv-dark-tablet", "en-dark-desk"],
-)
-@pytest.mark.exhaustive_for("en-dark-desk", "lv-dark-tablet")
-def test_it_reads_well_in_any_light_and_language(
-    language: str, dark: bool, size: tuple[int, int], studio: Fixture, look: Fixture, shots: Fixture, home: Path
-) -> None:
-    browser = look(size, dark, language, touch=size == TABLET)
-    page = started(browser, studio(*VIRTUAL, home=home).url)
-    page.wait_for_function("() => window.plushsenseLive.updates > 20")
-    assert axe(page) == []
-    assert no_sideways(page)
-    shots(page, f"live-{language}-{'dark' if dark else 'light'}")
-    assert browser.complaints == []
-
-
 @pytest.mark.exhaustive
 def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture, look: Fixture, home: Path) -> None:
     import plushsense as ps

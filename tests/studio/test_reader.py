@@ -90,16 +90,6 @@ def test_what_does_not_fit_is_refused_and_what_ran_goes_on(
     assert reader.now.running
 
 
-def test_a_bundle_of_another_layout_says_both(workspace: Workspace) -> None:
-    reader = workspace.part(LiveReader)
-    # The same labels, so that only the channels differ.
-    reader.start(LiveChoice(VIRTUAL, bundle(workspace)))
-    with pytest.raises(ConfigError, match=r"'plush-15'.*'accel-3'"):
-        reader.choose(bundle(workspace, "accel"), "float", "")
-    with pytest.raises(PlushSenseError, match="plush-15"):
-        reader.start(LiveChoice(f"{VIRTUAL}&layout=plush-15", bundle(workspace, "accel")))
-
-
 def test_it_starts_with_sentences_or_not_at_all(workspace: Workspace) -> None:
     reader = workspace.part(LiveReader)
     with pytest.raises(ConfigError, match="No network is chosen"):

@@ -480,32 +480,6 @@ def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixtu
 
 
 @pytest.mark.exhaustive
-def test_one_recording_has_no_violation_in_any_light(
-    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
-    url = studio(home=waves.parents[1]).url
-    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET), ("lv", False, DESK), ("en", True, TABLET)):
-        browser = look(size, dark, language, touch=size == TABLET)
-        page = browser.open(url + "/review?view=one&gesture=Wave")
-        opened(page)
-        checked(page)
-        page.keyboard.press("ArrowRight")
-        state(page, "draft")
-        assert axe(page) == []
-        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
-        shots(page, f"review-one-{language}-{'dark' if dark else 'light'}")
-        page.keyboard.press("x")
-        page.wait_for_selector("[data-test=reason]")
-        assert axe(page) == []
-        page.keyboard.press("Escape")
-        page.wait_for_selector("[data-test=reason]", state="detached")
-        page.keyboard.press("s")
-        state(page, "suggested")
-        assert browser.complaints == []
-    assert marks(waves) == []
-
-
-@pytest.mark.exhaustive
 def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> None:
     started = studio(home=waves.parents[1])
     ids = [r.id for r in open_dataset(waves).recordings if r.gesture == "Wave"]

@@ -204,24 +204,6 @@ def test_nothing_is_made_where_the_studio_was_started(studio: Fixture, look: Fix
     assert [p.name for p in (tmp_path / "home").iterdir()] == ["work"]
 
 
-@pytest.mark.parametrize("header", ["origin", "host"])
-def test_a_foreign_page_is_refused(header: str, empty: str) -> None:
-    import urllib.error
-    import urllib.request
-
-    asked = urllib.request.Request(
-        empty, headers={header: "http://evil.example" if header == "origin" else "evil.example"}
-    )
-    with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(asked, timeout=20)
-    assert refused.value.code == 400
-
-
-def test_a_furnished_home_opens(studio: Fixture, look: Fixture, home: Path) -> None:
-    page = look().open(studio(home=home).url)
-    assert marked(page, "title").inner_text() == "Home"
-
-
 HOSTILE = "<img src=x onerror='window.ran=1'>"
 RUNS = "javascript:window.ran=1"
 WAYS = re.compile(

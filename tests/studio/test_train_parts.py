@@ -117,7 +117,7 @@ def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.Monkey
         job_request(workspace, jobs, form)
     again = {"dataset": form["dataset"], "kind": "evaluate", "split": "by-subject:5"}
     proof = job_request(workspace, jobs, again)
-    jobs.start(proof.task, proof.dry, proof.title)
+    jobs.start(proof.task, proof.spec | {"dry": True}, proof.title)
     job_request(workspace, jobs, again)
     jobs.start(proof.task, proof.spec, proof.title)
     with pytest.raises(ConfigError, match="running already"):
