@@ -15,7 +15,7 @@ import pytest
 
 import plushsense as ps
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.studio.app.guard import path_in, zip_chunks
+from plushsense.studio.app.guard import path_in, zip_of
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.workspace import EXPORTS, Workspace, folder_digest
 from plushsense.studio.pages.export.exports import (
@@ -105,8 +105,8 @@ def test_facts_of_bundles(tmp_path: Path) -> None:
 def test_a_zip_on_the_way(little: Workspace) -> None:
     place = little.new(EXPORTS, "ā one")
     ps.export(little.bundles()[0], place)
-    packed = b"".join(zip_chunks(place))
-    assert packed == b"".join(zip_chunks(place))
+    packed = zip_of(place)
+    assert packed == zip_of(place)
     with zipfile.ZipFile(io.BytesIO(packed)) as archive:
         assert archive.testzip() is None
         got = {n.removeprefix("ā one/"): hashlib.sha256(archive.read(n)).hexdigest() for n in archive.namelist()}
@@ -119,7 +119,7 @@ def test_a_link_takes_nothing_along(little: Workspace, tmp_path: Path) -> None:
     ps.export(little.bundles()[0], place)
     (tmp_path / "secret").write_text("secret")
     (place / "golden" / "secret").symlink_to(tmp_path / "secret")
-    with zipfile.ZipFile(io.BytesIO(b"".join(zip_chunks(place)))) as archive:
+    with zipfile.ZipFile(io.BytesIO(zip_of(place))) as archive:
         assert "one/golden/secret" not in archive.namelist()
     (little.folder / EXPORTS / "away").symlink_to(tmp_path)
     for name in ("away", "..", ".", "../bundles"):

@@ -256,9 +256,7 @@ def test_keys_are_no_commands_while_something_else_has_them(waves: Path, studio:
     assert browser.complaints == []
 
 
-def test_excluding_needs_a_reason_and_is_taken_back(
-    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
+def test_excluding_needs_a_reason_and_is_taken_back(waves: Path, studio: Fixture, look: Fixture) -> None:
     browser = look()
     page = browser.open(studio(home=waves.parents[1]).url + "/review?view=one")
     first = opened(page)
@@ -267,7 +265,6 @@ def test_excluding_needs_a_reason_and_is_taken_back(
     marked(page, "reason-go").click()
     page.get_by_text("A reason is missing").wait_for()
     assert axe(page) == []
-    shots(page, "review-dialog-en-light")
     marked(page, "own-reason").fill("a dog barked")
     marked(page, "own-reason").press("Enter")
     page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.recording !== was", arg=[PLOT, first])
@@ -312,9 +309,7 @@ def test_a_finding_is_accepted_with_a_reason(waves: Path, studio: Fixture, look:
 
 
 @pytest.mark.exhaustive
-def test_the_table_filters_sorts_and_says_what_it_shows(
-    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
+def test_the_table_filters_sorts_and_says_what_it_shows(waves: Path, studio: Fixture, look: Fixture) -> None:
     append_marks(waves, [Mark(open_dataset(waves).recordings[0].id, "exclude", "x", "y")])
     url = studio(home=waves.parents[1]).url
     for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
@@ -324,7 +319,6 @@ def test_the_table_filters_sorts_and_says_what_it_shows(
         checked(page)
         assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth"), "no sideways scrolling"
         assert axe(page) == []
-        shots(page, f"review-table-{language}-{'dark' if dark else 'light'}")
         assert browser.complaints == []
     page = look().open(url + "/review")
     rows = page.locator("[data-test=table] tbody tr")
@@ -418,7 +412,7 @@ def test_decisions_about_many_recordings(waves: Path, studio: Fixture, look: Fix
 
 
 @pytest.mark.exhaustive
-def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
+def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: Fixture) -> None:
     url = studio(home=waves.parents[1]).url
     longest = max(open_dataset(waves).recordings, key=lambda r: r.rows).id
     for language, dark, size in (("lv", True, PHONE), ("en", False, DESK)):
@@ -426,7 +420,6 @@ def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: F
         page = browser.open(url + "/review?view=durations&gesture=Wave")
         marked(page, "duration-outliers").get_by_text(longest).wait_for()
         assert axe(page) == []
-        shots(page, f"review-durations-{language}-{'dark' if dark else 'light'}")
         assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
         assert browser.complaints == []
     assert "Recordings: 21. Mean 2.74 s, median 2.50 s" in marked(page, "durations-summary").inner_text()
@@ -456,17 +449,13 @@ def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: F
 
 
 @pytest.mark.exhaustive
-def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
+def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixture) -> None:
     url = studio(home=waves.parents[1]).url
     longest = max(open_dataset(waves).recordings, key=lambda r: r.rows).id
-    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
-        browser = look(size, dark, language)
-        page = browser.open(url + "/review?view=overlay&gesture=Wave")
-        page.wait_for_selector(f"[data-test=outliers] :text('{longest}')")
-        assert axe(page) == []
-        shots(page, f"review-overlay-{language}-{'dark' if dark else 'light'}")
-        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
-        assert browser.complaints == []
+    page = look(TABLET, True, "lv").open(url + "/review?view=overlay&gesture=Wave")
+    page.wait_for_selector(f"[data-test=outliers] :text('{longest}')")
+    assert axe(page) == []
+    assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
     marked(page, "outliers").get_by_role("button").first.click()
     assert opened(page) == longest
     page = look().open(url + "/review?view=overlay&gesture=Wave")
@@ -579,12 +568,6 @@ def test_a_broken_data_set_is_a_sentence(waves: Path, studio: Fixture, look: Fix
     assert browser.complaints == []
 
 
-def test_no_data_set_yet(tmp_path: Path, studio: Fixture, look: Fixture) -> None:
-    page = look().open(studio().url + "/review")
-    page.get_by_text("There is no data set yet").wait_for()
-    assert axe(page) == []
-
-
 def test_labelled_recordings_need_no_trimming(real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture) -> None:
     source = tmp_path / "har"
     source.mkdir()
@@ -616,9 +599,7 @@ def test_labelled_recordings_need_no_trimming(real_data: Path, tmp_path: Path, s
 STREAM = "[data-test=stream-plot]"
 
 
-def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
-    tmp_path: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
+def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(tmp_path: Path, studio: Fixture, look: Fixture) -> None:
     place = streamed(tmp_path / "home" / "datasets" / "streams")
     browser = look()
     page = browser.open(studio(home=tmp_path / "home").url + "/review?view=stream")
@@ -662,7 +643,6 @@ def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
     page.keyboard.press("h")
     page.wait_for_selector("[data-test=stretches] :text('Handling')")
     assert axe(page) == []
-    shots(page, "review-stream-en-light")
     lines = [(m["recording"], m["action"], m["label"]) for m in marks(place)]
     assert lines == [("P1/fulldatastream", "label", k) for k in ("rest", "practice:Wave", "handling")]
     assert [(m["start"], m["stop"]) for m in marks(place)] == [
@@ -692,9 +672,7 @@ def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
 
 
 @pytest.mark.exhaustive
-def test_real_recordings_one_after_the_other(
-    real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
+def test_real_recordings_one_after_the_other(real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture) -> None:
     place = tmp_path / "home" / "datasets" / "real"
     place.parent.mkdir(parents=True)
     import_recordings(real_data / "makeability-gestures", place, layout="accel-3")
@@ -710,7 +688,6 @@ def test_real_recordings_one_after_the_other(
     assert [m["recording"] for m in marks(place)] == seen[:25]
     times = page.evaluate(f"() => document.querySelector('{PLOT}').psPlot.times")
     assert len(times) == 25
-    shots(page, "review-real-en-light")
     # The one that nobody stopped, 18907 rows: drawn thinned, closer in full.
     longest = max(open_dataset(place).recordings, key=lambda r: r.rows)
     page.goto(page.url.split("?")[0] + f"?recording={longest.id.replace(' ', '%20')}")

@@ -54,7 +54,7 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 )
 @pytest.mark.exhaustive_for("en-light-desk")
 def test_pages_open_without_complaint(
-    language: str, dark: bool, size: tuple[int, int], empty: str, look: Fixture, shots: Fixture
+    language: str, dark: bool, size: tuple[int, int], empty: str, look: Fixture
 ) -> None:
     browser = look(size, dark, language, own=True)
     for name, path in PAGES.items():
@@ -63,12 +63,24 @@ def test_pages_open_without_complaint(
         assert axe(page) == [], name
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} scrolls sideways"
         assert page.locator(".ps-bar [aria-current]").evaluate(_IN_VIEW), name
-        shots(page, f"{name}-{language}-{'dark' if dark else 'light'}")
         browser.leave(page)
     assert browser.complaints == []
     # The icons are drawn, see `icons.js`: their font would be a third of a page.
     fonts = [url for url in browser.asked if url.endswith(".woff2")]
     assert len(set(fonts)) <= 2, fonts
+
+
+@pytest.mark.parametrize(
+    ("page", "text"),
+    [
+        ("review", "There is no data set yet"),
+        ("train", "There are no results yet"),
+        ("export", "Train one first"),
+        ("publish", "There is no data set yet"),
+    ],
+)
+def test_an_empty_page_says_what_to_do(page: str, text: str, empty: str, look: Fixture) -> None:
+    look().open(empty + PAGES[page]).get_by_text(text).first.wait_for()
 
 
 def test_every_icon_is_drawn() -> None:

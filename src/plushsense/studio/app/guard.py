@@ -10,14 +10,14 @@ import io
 import ipaddress
 import secrets
 import zipfile
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 from fastapi import APIRouter
-from fastapi.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from jinja2 import ChoiceLoader, DictLoader, Environment
 from starlette.requests import ClientDisconnect
 
@@ -165,12 +165,13 @@ class Guard:
             else:
                 await _refuse(scope, send, 401, _TOKEN_NEEDED)
         elif not self._visitors.open and scope["method"] == "GET" and (visitor := self._visitors.admit(query)):
-            await _to_start(send, "" if self._visitors.admits(headers) else visitor)
+            await _to_start(scope, send, "" if self._visitors.admits(headers) else visitor)
         elif self._visitors.admits(headers):
             await _bounded(self._app, scope, receive, send, headers)
         elif scope["path"] == "/" and query == WELCOME:
             # After a link from another page, a browser does not send the SameSite cookie with its first request.
-            await _answer(send, 200, b'<!doctype html><meta http-equiv="refresh" content="0;url=/">', "text/html")
+            page = '<!doctype html><meta http-equiv="refresh" content="0;url=/">'
+            await _answer(scope, send, HTMLResponse(page, headers=_CLOSE))
         else:
             await _refuse(scope, send, 401, _TOKEN_NEEDED)
 
@@ -227,39 +228,38 @@ def _is_upload(scope: Scope) -> bool:
     return bool(scope["method"] == "POST" and parts[1:3] == ["_nicegui", "client"] and parts[4:5] == ["upload"])
 
 
-async def _to_start(send: Send, visitor: str) -> None:
+_CLOSE = {"connection": "close"}
+
+
+async def _to_start(scope: Scope, send: Send, visitor: str) -> None:
     """Redirect to the home page, which removes the token from the address, and set the cookie ``visitor`` if given."""
-    headers = [
-        (b"location", f"/?{WELCOME}".encode()),
-        (b"cache-control", b"no-store"),
-        *_security_headers(secrets.token_urlsafe(16)),
-    ]
+    response = RedirectResponse(f"/?{WELCOME}", 303)
     if visitor:
-        headers.append((b"set-cookie", f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict".encode()))
-    await send({"type": "http.response.start", "status": 303, "headers": headers})
-    await send({"type": "http.response.body", "body": b""})
+        response.set_cookie(COOKIE, visitor, httponly=True, samesite="strict")
+    await _answer(scope, send, response)
 
 
 async def _refuse(scope: Scope, send: Send, status: int, message: str) -> None:
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 1008, "reason": message[:100]})
-    else:
-        await _answer(send, status, f"{message}\n".encode(), "text/plain")
+        return
+    # Close the connection, except after 413: a browser reads that response only after sending the whole body.
+    await _answer(scope, send, PlainTextResponse(f"{message}\n", status, headers=None if status == 413 else _CLOSE))
 
 
-async def _answer(send: Send, status: int, body: bytes, kind: str) -> None:
-    headers = [(b"content-type", f"{kind}; charset=utf-8".encode()), (b"cache-control", b"no-store")]
-    headers += _security_headers(secrets.token_urlsafe(16))
-    if status != 413:
-        # Close the connection, except after 413: a browser reads that response only after sending the whole body.
-        headers.append((b"connection", b"close"))
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+async def _answer(scope: Scope, send: Send, response: Response) -> None:
+    """Send a response that is not that of the application."""
+    response.headers["cache-control"] = "no-store"
+    response.raw_headers += _security_headers(secrets.token_urlsafe(16))
+    await response(scope, _nothing, send)
+
+
+async def _nothing() -> dict[str, Any]:
+    return {"type": "http.disconnect"}
 
 
 # Downloads --------------------------------------------------------------------------------------------------------
 
-_CHUNK = 1 << 16
 _MAX_NAME = 255
 """Maximum length of a file name in bytes; file systems report longer names in different ways."""
 
@@ -283,7 +283,7 @@ def router(workspace: Workspace) -> APIRouter:
             return PlainTextResponse(f"{refusal}\n", 404)
         if kind == EXPORTS and (path / FACTS).is_file():
             headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(path.name, safe='')}.zip"}
-            return StreamingResponse(zip_chunks(path), media_type="application/zip", headers=headers)
+            return Response(zip_of(path), media_type="application/zip", headers=headers)
         if kind != EXPORTS and path.is_file():
             return FileResponse(path, media_type="application/zip", filename=path.name)
         return PlainTextResponse(f"There is no {kind.removesuffix('s')} '{name}' in this studio.\n", 404)
@@ -307,38 +307,11 @@ def path_in(workspace: Workspace, kind: str, name: str) -> Path:
     return place
 
 
-def zip_chunks(folder: Path) -> Iterator[bytes]:
-    """Yield a zip archive of a folder in chunks while it is being built; equal files give equal bytes.
-
-    Links to places outside the folder are left out.
-    """
-    pipe = _Pipe()
-    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:
+def zip_of(folder: Path) -> bytes:
+    """Return a zip archive of an export; equal files give equal bytes. Links to places outside are left out."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
         for path in list_package_files(folder):
-            if folder.resolve() not in path.resolve().parents:
-                continue
-            entry = zip_entry(f"{folder.name}/{path.relative_to(folder).as_posix()}")
-            with path.open("rb") as source, archive.open(entry, "w") as target:
-                while chunk := source.read(_CHUNK):
-                    target.write(chunk)
-                    yield pipe.take()
-    yield pipe.take()
-
-
-class _Pipe(io.RawIOBase):
-    """Buffer between `zipfile` and the response. It is not seekable, so `zipfile` writes sizes after the data."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: object) -> int:
-        content = bytes(data)  # type: ignore[call-overload]
-        self._buffer += content
-        return len(content)
-
-    def take(self) -> bytes:
-        content, self._buffer = bytes(self._buffer), bytearray()
-        return content
+            if folder.resolve() in path.resolve().parents:
+                archive.writestr(zip_entry(f"{folder.name}/{path.relative_to(folder).as_posix()}"), path.read_bytes())
+    return packed.getvalue()

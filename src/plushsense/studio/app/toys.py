@@ -344,12 +344,6 @@ class Toys:
                     return name
         return ""
 
-    def person(self, number: int) -> str:
-        """Choose the virtual toy used by virtual person ``number``, and return its URL."""
-        if not 1 <= number <= PERSONS:
-            raise ConfigError("There is no virtual person {n}. Choose one from 1 to {most}.", n=number, most=PERSONS)
-        return self.choose(f"virtual://?person={number}")
-
     @property
     def simulated(self) -> bool:
         """True if the chosen toy is a virtual one."""

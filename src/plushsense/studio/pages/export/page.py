@@ -81,14 +81,12 @@ def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJ
 
 
 def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
-    text(
-        words(
-            "An answer is due every {step} ms. Instructions are counted exactly, on emulators. Times are estimated "
-            "from them, as a lower and an upper bound: nothing was measured on a real chip.",
-            step=words.significant(profile["step_ms"], 3),
-        ),
-        classes="ps-dim",
+    about = words(
+        "An answer is due every {step} ms. Instructions are counted exactly, on emulators. Times are estimated from "
+        "them, as a lower and an upper bound: nothing was measured on a real chip.",
+        step=words.significant(profile["step_ms"], 3),
     )
+    text(about, classes="ps-dim")
     rows = [
         (
             each["chip"],
@@ -227,14 +225,12 @@ class VerificationCard:
         missing = await run.io_bound(targets) or {}
         with tag(ui.column().classes("ps-card w-full"), "proof"):
             text(words(in_context("heading", "Verify")), "h3")
-            text(
-                words(
-                    "The C code in this folder is compiled and run if it is exactly what this version of PlushSense "
-                    "writes for the network. Each answer is compared with that of the exact network, also in test "
-                    "scenarios, which use the same network with other decision rules."
-                ),
-                classes="ps-dim",
+            about = words(
+                "The C code in this folder is compiled and run if it is exactly what this version of PlushSense writes "
+                "for the network. Each answer is compared with that of the exact network, also in test scenarios, "
+                "which use the same network with other decision rules."
             )
+            text(about, classes="ps-dim")
             with ui.expansion(words("More settings")).classes("w-full"):
                 with ui.row().classes("w-full"):
                     for name in (n for n, packages in missing.items() if not packages):
@@ -250,19 +246,13 @@ class VerificationCard:
                 self._dataset = ui.select(options, value="", label=words("Also stream the recordings of")).classes(
                     "w-full"
                 )
-                self._faults = tag(
-                    ui.checkbox(words("Also insert faults, one at a time; each must be detected (takes minutes)")),
-                    "faults",
+                faults = words("Also insert faults, one at a time; each must be detected (takes minutes)")
+                self._faults = tag(ui.checkbox(faults), "faults")
+                trust = words(
+                    "Also compile and run C files that were changed or come from elsewhere (they can do anything on "
+                    "this computer that you can do)"
                 )
-                self._trust = tag(
-                    ui.checkbox(
-                        words(
-                            "Also compile and run C files that were changed or come from elsewhere (they can do "
-                            "anything on this computer that you can do)"
-                        )
-                    ),
-                    "trust",
-                )
+                self._trust = tag(ui.checkbox(trust), "trust")
             start = button("verify", words("Verify"), self._start, "", icon="fact_check")
             start.set_enabled(bool(self._chosen))
             proof = newest_job(self.page.workspace.part(Jobs), "verify", self.export.folder)
@@ -380,10 +370,8 @@ class VerificationCard:
         with ui.expansion(words("{n} inserted faults", n=len(rows))).classes("w-full"):
             table(words("Inserted faults, one at a time"), words.each("Where", "Fault", "Target", "Verdict"), rows)
             if any(f["silent"] for f in faults):
-                text(
-                    words("Cannot be detected: no test scenario of this network depends on that line of the rules."),
-                    classes="ps-dim",
-                )
+                why = words("Cannot be detected: no test scenario of this network depends on that line of the rules.")
+                text(why, classes="ps-dim")
 
 
 _TASKS = ("export", "profile", "verify")
@@ -403,13 +391,11 @@ class _Exporting:
 
     async def build(self) -> None:
         style()
-        text(
-            self.words(
-                "Put a trained network into a toy: the studio writes a folder for the person who programs the toy. "
-                "Everything stays on this computer."
-            ),
-            classes="ps-dim",
+        about = self.words(
+            "Put a trained network into a toy: the studio writes a folder for the person who programs the toy. "
+            "Everything stays on this computer."
         )
+        text(about, classes="ps-dim")
         await self._form()
         self.work = WorkPanel(self.page, _TASKS, self._progress_text, self._ended, self._allow)
         self._allow()
@@ -453,25 +439,19 @@ class _Exporting:
         extras = await run.io_bound(formats) or {}
         self._formats: dict[str, ui.checkbox] = {}
         text(words("Also for other runtimes"), "h3")
-        text(
-            words(
-                "These formats compute a whole window for each answer. Each is tested in its own runtime before it "
-                "is written."
-            ),
-            classes="ps-dim",
+        about = words(
+            "These formats compute a whole window for each answer. Each is tested in its own runtime before it is "
+            "written."
         )
+        text(about, classes="ps-dim")
         for name in (n for n, extra in extras.items() if not extra):
             self._formats[name] = tag(ui.checkbox(f"{name}: {CONVERTERS[name].holds}"), f"format-{name}")
         for extra in dict.fromkeys(e for e in extras.values() if e):
             missing = ", ".join(n for n, needed in extras.items() if needed == extra)
-            text(
-                words(
-                    "Not installed: {names}. Install with  pip install 'plushsense[{extra}]'",
-                    names=missing,
-                    extra=extra,
-                ),
-                classes="ps-dim",
+            about = words(
+                "Not installed: {names}. Install with  pip install 'plushsense[{extra}]'", names=missing, extra=extra
             )
+            text(about, classes="ps-dim")
         text(words("Calibration for 8 bits"), "h3")
         options = {"": words("From training, as stored in the network")} | await titles(self.workspace)
         self._dataset = ui.select(options, value="", label=words("Data set for the calibration")).classes("w-full")

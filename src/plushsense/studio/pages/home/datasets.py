@@ -74,11 +74,8 @@ class DatasetSection:
             ui.label(" · ".join(facts)).classes("ps-dim")
             checks = [j for j in self._jobs.all("check") if j.spec.get("dataset") == str(entry.path)]
             last = next((j for j in checks if j.state == DONE and j.result.get("dataset") == str(entry.path)), None)
-            ui.label(
-                findings_text(page, last.result)
-                if last is not None
-                else words(in_context("data set", "Not checked yet."))
-            )
+            unchecked = words(in_context("data set", "Not checked yet."))
+            ui.label(unchecked if last is None else findings_text(page, last.result))
             with ui.row().classes("items-center ps-small-gap"):
                 page_links(page, ("review", "train", "publish"), entry.name, dataset=entry.path)
                 if not any(j.state == RUNNING for j in checks):

@@ -12,7 +12,7 @@ from plushsense.studio.app.jobs import RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, button, html, named, on_change, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import DATASETS, WORK
+from plushsense.studio.app.workspace import DATASETS, VIRTUAL, WORK
 from plushsense.studio.pages.home.datasets import DatasetSection
 from plushsense.studio.pages.home.incoming import IncomingSection
 from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
@@ -225,7 +225,7 @@ class NextStepCard:
         workspace = self._page.workspace
         with self._page.show_errors():
             if not workspace.toy:
-                self._toys.person(7)
+                self._toys.choose(VIRTUAL)
             name = workspace.free_name(DATASETS, self._page.words("virtual toy"), separator=" ")
             spec = {
                 "people": _PEOPLE,

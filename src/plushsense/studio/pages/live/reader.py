@@ -25,7 +25,7 @@ from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-from plushsense.studio.pages.live.state import Connection, EventSpan, LiveChoice, LiveState, Performed, quiet_reason
+from plushsense.studio.pages.live.state import Connection, EventSpan, LiveChoice, LiveState, quiet_reason
 
 KEPT_SPANS = 200
 KEPT_SPAN_S = 600.0
@@ -72,7 +72,7 @@ class LiveReader:
         self._events: dict[int, EventSpan] = {}
         self._begun = self._changes = 0
         self._first = 1
-        self._performed: list[Performed] = []
+        self._performed: list[PerformedGesture] = []
         self._started = 0.0
         self.subject = ""
         self._next: _BundleRun | None = None
@@ -238,8 +238,8 @@ class LiveReader:
         with self._lock:
             return list(self._events.values())
 
-    def performed(self, since: int = 0) -> list[Performed]:
-        """Return the gestures that the virtual person has made since the toy was opened, those after ``since``."""
+    def performed(self, since: int = 0) -> list[PerformedGesture]:
+        """Return the gestures that the virtual person has made since the toy was opened, but the first ``since``."""
         with self._lock:
             return self._performed[since:]
 
@@ -399,16 +399,15 @@ class LiveReader:
     def _add_performed(self, device: VirtualDevice, made: PerformedGesture) -> None:
         """Note a gesture that the virtual person begins; called in the reader thread."""
         with self._lock:
-            number = len(self._performed) + 1
-            self._performed.append(Performed(number, made.label, made.start_s, made.end_s))
-            self.now = replace(self.now, performed=number, next_gesture=device.prompted)
+            self._performed.append(made)
+            self.now = replace(self.now, performed=len(self._performed), next_gesture=device.prompted)
 
     def _performed_in(self, begin_s: float, end_s: float) -> str | None:
         """Return the gesture of the virtual person that an event reports, "" for none, None for any other toy."""
         if self.device is None or _virtual(self.device) is None:
             return None
         overlaps = {
-            min(end_s, made.end_s + _LATE_S) - max(begin_s, made.begin_s - _EARLY_S): made.label
+            min(end_s, made.end_s + _LATE_S) - max(begin_s, made.start_s - _EARLY_S): made.label
             for made in self._performed[-20:]
         }
         longest = max(overlaps, default=0.0)

@@ -62,12 +62,10 @@ class _Publishing:
     async def build(self) -> None:
         words = self.words
         style()
-        text(
-            words(
-                "Makes a package of a data set that others can use, and checks it with the validators of each format."
-            ),
-            classes="ps-dim",
+        about = words(
+            "Makes a package of a data set that others can use, and checks it with the validators of each format."
         )
+        text(about, classes="ps-dim")
         with ui.row().classes("ps-message ps-message-warning w-full items-center no-wrap"):
             ui.icon("lock").props('aria-hidden="true"')
             danger = words(
@@ -95,10 +93,8 @@ class _Publishing:
         with tag(ui.column().classes("ps-card w-full"), "new"):
             text(words("New package"), "h2")
             if not options:
-                tag(
-                    text(words("There is no data set yet. Record a session, or import recordings on the home page.")),
-                    "no-dataset",
-                )
+                none = words("There is no data set yet. Record a session, or import recordings on the home page.")
+                tag(text(none), "no-dataset")
                 return
             dataset = self.query.get("dataset", "")
             first = dataset if dataset in options else next(iter(options))

@@ -95,28 +95,18 @@ class RecordingFilter:
 
     def fits(self, row: ReviewedRecording, word: Callable[[str], str] = str) -> bool:
         """Return whether a recording meets all conditions; ``word`` translates the messages of findings."""
+        severity = {"": True, NO_FINDING: not row.worst}.get(self.severity)
+        if severity is None:
+            severity = bool(row.worst) and SEVERITIES.index(row.worst) <= SEVERITIES.index(self.severity)
+        text = self.text.strip().casefold()
         return (
             self.person in ("", row.info.subject)
             and self.gesture in ("", row.info.gesture)
-            and self._state_fits(row)
-            and self._severity_fits(row)
+            and self.state in ("", row.state, DONE if row.done else TO_DO)
+            and severity
             and (not self.check or any(f.check == self.check for f in row.findings))
-            and self._text_fits(row, word)
+            and any(text in s.casefold() for s in (row.id, *(word(f.message) for f in row.findings if text)))
         )
-
-    def _state_fits(self, row: ReviewedRecording) -> bool:
-        if self.state in (TO_DO, DONE):
-            return row.done == (self.state == DONE)
-        return self.state in ("", row.state)
-
-    def _severity_fits(self, row: ReviewedRecording) -> bool:
-        if self.severity in ("", NO_FINDING):
-            return not self.severity or not row.worst
-        return bool(row.worst) and SEVERITIES.index(row.worst) <= SEVERITIES.index(self.severity)
-
-    def _text_fits(self, row: ReviewedRecording, word: Callable[[str], str]) -> bool:
-        text = self.text.strip().casefold()
-        return any(text in s.casefold() for s in (row.id, *(word(f.message) for f in row.findings if text)))
 
     @classmethod
     def of(cls, query: Mapping[str, str]) -> RecordingFilter:

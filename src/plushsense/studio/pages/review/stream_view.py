@@ -72,13 +72,11 @@ class StreamView:
                         icon_button(icon, words(text), lambda f=factor: self.plot.zoom(f)).classes("ps-act")
                     for icon, text, share in (("chevron_left", "Earlier", -0.5), ("chevron_right", "Later", 0.5)):
                         icon_button(icon, words(text), lambda s=share: self.plot.pan(s)).classes("ps-act")
-                ui.label(
-                    words(
-                        "Drag over a stretch between the recordings, or click its beginning and Shift-click its end; "
-                        "then press a button or its key. Keys: + − 0 zoom, ← → move, u undoes, Esc clears the "
-                        "selection."
-                    )
-                ).classes("ps-dim")
+                about = words(
+                    "Drag over a stretch between the recordings, or click its beginning and Shift-click its end; then "
+                    "press a button or its key. Keys: + − 0 zoom, ← → move, u undoes, Esc clears the selection."
+                )
+                ui.label(about).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
                 ui.label(words("Labelled stretches")).classes("text-bold")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "stretches")

@@ -433,14 +433,9 @@ class TrainingForm:
         with self._show_errors():
             request = self._request()
             if request.task in (SWEEP, SEARCH) and self._estimated != request.key:
-                self._page.say(
-                    self._words(
-                        "The settings have changed since then. Estimate again."
-                        if self._estimated
-                        else "Look at the cost first: press “How long will it take?”, then start."
-                    ),
-                    "warning",
-                )
+                changed = self._words("The settings have changed since then. Estimate again.")
+                first = self._words("Look at the cost first: press “How long will it take?”, then start.")
+                self._page.say(changed if self._estimated else first, "warning")
                 return
             self._begin(request)
             self._estimated = ""

@@ -142,14 +142,13 @@ class ResultDetailsView:
     def _confusions(self, d: ResultDetails) -> None:
         w = self._words
         heading(w("Confusions"), 4)
-        ui.label(
-            w(
-                "Rows: the true gesture. Columns: the answer of the network. Each cell has the number of windows and "
-                "their share of the row. Click a number to see the recordings."
-                if d.clickable
-                else "For this network only the counts are stored. Evaluate it to see the recordings behind them."
-            )
-        ).classes("ps-dim")
+        about = w(
+            "Rows: the true gesture. Columns: the answer of the network. Each cell has the number of windows and their "
+            "share of the row. Click a number to see the recordings."
+            if d.clickable
+            else "For this network only the counts are stored. Evaluate it to see the recordings behind them."
+        )
+        ui.label(about).classes("ps-dim")
         if d.pooled is not None and d.row.rest is not None:
             text = w(
                 "Pooled over all windows at once, with recordings at rest, the accuracy is {pooled}. The matrix counts "

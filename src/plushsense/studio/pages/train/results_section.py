@@ -80,12 +80,11 @@ class ResultsSection:
         self._open = ""
         w = self._words
         with section(w("Results"), classes=""):
-            ui.label(
-                w(
-                    "Compare scores only if data, split and context are the same. A training has one seed and was "
-                    "checked on a few people: do not report its score."
-                )
-            ).classes("ps-dim")
+            about = w(
+                "Compare scores only if data, split and context are the same. A training has one seed and was checked "
+                "on a few people: do not report its score."
+            )
+            ui.label(about).classes("ps-dim")
             with ui.row().classes("items-center"):
                 self._by_data = ui.select({"": w("all data sets")}, value="", label=w("Data set"))
                 tag(self._by_data.classes("w-64"), "filter-data").on_value_change(self._filtered)
