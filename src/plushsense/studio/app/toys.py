@@ -22,7 +22,6 @@ from plushsense.devices.opening import (
     SCAN_S,
     DeviceInfo,
     DeviceListing,
-    check_address,
     is_virtual,
     list_devices,
     open_device,
@@ -312,10 +311,6 @@ class Toys:
             self._workspace.toy, self.trial = url, None
         self.changed.notify()
         return url
-
-    def check(self, url: str) -> None:
-        """Raise an error if no toy can be at this address, see `check_address`."""
-        check_address(parse_url(url.strip()))
 
     def try_out(self) -> None:
         """Test the chosen toy in the background; `trial` has the state and the result."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.devices.opening import check_address, parse_url
 from plushsense.studio.app.shell import Kind, Page, button, message_row, on_change, on_page, tag
 from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, described, with_layout
 from plushsense.studio.app.words import Texts
@@ -54,7 +55,7 @@ class ToySection:
         """Choose the toy at the address that was typed; an error is shown beside the field."""
         with errors_beside(self._page, self._address):
             url = str(self._address.value or "").strip()
-            self._toys.check(url)
+            check_address(parse_url(url))
             self._toys.choose(url)
             self._try_out()
 

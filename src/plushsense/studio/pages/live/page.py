@@ -18,7 +18,7 @@ from plushsense.studio.app.shell import Page, button, named, on_change, query, q
 from plushsense.studio.app.toys import Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL
-from plushsense.studio.pages.live import adapting_page, validation_page
+from plushsense.studio.pages.live import adapting, validation_page
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.log import LogButtons
 from plushsense.studio.pages.live.reader import LiveReader
@@ -49,10 +49,10 @@ def show(page: Page) -> None:
 
     on_change(reader.changed, update_mark)
     update_mark()
-    view, people = LiveView(words, feed), adapting_page.PersonFields(page, reader)
+    view, people = LiveView(words, feed), adapting.PersonFields(page, reader)
     with view:
         _person_panel(page, reader)
-        adapting_page.show(page, people)
+        adapting.show(page, people)
     with view.add_slot("log"):
         log = LogButtons(page, reader)
     follow(view, feed, reader)

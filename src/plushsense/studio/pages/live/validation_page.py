@@ -15,7 +15,7 @@ from plushsense.experiments.protocol.run import PAGE, TABLE, TRIALS
 from plushsense.experiments.protocol.score import NAMELESS
 from plushsense.studio.app.shell import Page, button, html, moment, on_change, section, tag
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.live.adapting_page import PersonFields
+from plushsense.studio.pages.live.adapting import PersonFields
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.validation import FOLDER, Validation
 from plushsense.studio.widgets.elements import notice, picture, scroll_to, summary, table
