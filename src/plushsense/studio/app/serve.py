@@ -72,7 +72,7 @@ def run(
     os.environ.pop("NICEGUI_REDIS_URL", None)
     with _without_clients():
         need("nicegui", "studio")
-        from nicegui import app, ui
+        from nicegui import app
 
     lock = _lock_folder(workspace)
     port = _free_port(host, port)
@@ -90,15 +90,24 @@ def run(
         _wait_open(host_name, port)
         on_ready(workspace.invite() if workspace.invite else address)
 
-    limits = ConnectionLimits.of_process()
     _configure(workspace, visitors)
     app.on_startup(lambda: threading.Thread(target=announce, daemon=True).start())
+    _listen(host, port, show and visitors.open)
+    if lock is not None:
+        lock.release()
+
+
+def _listen(host: str, port: int, show: bool) -> None:
+    """Run the web server until it is interrupted."""
+    from nicegui import ui
+
+    limits = ConnectionLimits.of_process()
     ui.run(
         host=host,
         port=port,
         title="PlushSense",
         favicon=_ICON,
-        show=show and visitors.open,
+        show=show,
         reload=False,
         tailwind=False,
         show_welcome_message=False,
@@ -109,8 +118,6 @@ def run(
         backlog=limits.backlog,
         h11_max_incomplete_event_size=HEAD_BYTES,
     )
-    if lock is not None:
-        lock.release()
 
 
 def _configure(workspace: Workspace, visitors: Visitors) -> None:

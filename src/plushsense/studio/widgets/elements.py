@@ -14,7 +14,6 @@ import jinja2
 from markupsafe import Markup
 from nicegui import context, run, ui
 from nicegui.element import Element
-from nicegui.events import GenericEventArguments
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import plain_label
@@ -281,7 +280,7 @@ _VENDOR = Path(__file__).parent / "vendor" / "uplot"
 
 
 class Plot(Element, component="plot.js"):
-    """Plot of curves over x with one y-axis and vertical marks, drawn by uPlot.
+    """Plot of curves over x with one y-axis, drawn by uPlot.
 
     Args:
         label: name for screen readers.
@@ -290,9 +289,6 @@ class Plot(Element, component="plot.js"):
         x, y: titles of the axes, with units.
         height: height in pixels; the width is that of the surrounding element.
         window_s: length of the visible part of a live plot in seconds, see `push`.
-        range_y: limits of the y-axis, or None to fit the data.
-        values_y: whether the y-axis displays values.
-        on_pick: called on every click with x, "left" or "right", and whether shift is held.
     """
 
     def __init__(
@@ -304,49 +300,30 @@ class Plot(Element, component="plot.js"):
         y: str = "",
         height: int = 240,
         window_s: float = 0.0,
-        range_y: tuple[float, float] | None = None,
-        values_y: bool = True,
-        on_pick: Callable[[float, str, bool], Any] | None = None,
     ) -> None:
         super().__init__()
         self.add_resource(_VENDOR)
         self._props.update(label=label, series=[dict(s) for s in series], xTitle=x, yTitle=y, height=height)
-        self._props.update(windowS=window_s, rangeY=list(range_y) if range_y else None, valuesY=values_y)
-        self._props.update(pickable=on_pick is not None, start=None)
+        self._props.update(windowS=window_s, start=None)
         self.classes("w-full")
-        if on_pick is not None:
 
-            def picked(event: GenericEventArguments) -> Any:
-                return on_pick(float(event.args["x"]), str(event.args["button"]), bool(event.args["shift"]))
-
-            self.on("pick", picked)
-
-    def begin(
-        self, x: Sequence[float], curves: Sequence[Sequence[float | None]], marks: Sequence[dict[str, Any]] = ()
-    ) -> Plot:
+    def begin(self, x: Sequence[float], curves: Sequence[Sequence[float | None]]) -> Plot:
         """Set the curves to display when the page opens; call this while building the page."""
-        self._props["start"] = {"data": [list(x), *map(list, curves)], "marks": list(marks)}
+        self._props["start"] = [list(x), *map(list, curves)]
         return self
 
     def show(
         self,
         x: Sequence[float],
         curves: Sequence[Sequence[float | None]],
-        marks: Sequence[dict[str, Any]] | None = None,
         series: Sequence[dict[str, Any]] | None = None,
     ) -> None:
-        """Replace all curves and, if given, the marks and the series; None in a curve is a gap."""
-        self.run_method("show", [list(x), *map(list, curves)], marks, series)
+        """Replace all curves and, if given, the series; None in a curve is a gap."""
+        self.run_method("show", [list(x), *map(list, curves)], series)
 
     def push(self, x: Sequence[float], curves: Sequence[Sequence[float]]) -> None:
         """Append samples at the right end of a live plot, and drop those that leave its window."""
         self.run_method("push", list(x), [list(c) for c in curves])
-
-    def lines(self, marks: Sequence[dict[str, Any]]) -> None:
-        """Replace the vertical lines; each has ``x``, ``label``, ``stroke``, and optionally ``dash`` (such as [6, 4]),
-        ``to`` (end of a shaded range) and ``row`` (vertical position of the label).
-        """
-        self.run_method("setMarks", list(marks))
 
 
 # Pictures ---------------------------------------------------------------------------------------------------------

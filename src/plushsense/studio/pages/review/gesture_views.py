@@ -11,7 +11,7 @@ from plushsense.dataset.statistics import DurationBand, duration_bands
 from plushsense.studio.app.shell import LINES, address, button, tag
 from plushsense.studio.app.words import in_context
 from plushsense.studio.pages.review.controller import DURATIONS, ReviewController
-from plushsense.studio.pages.review.plot import ReviewPlot
+from plushsense.studio.pages.review.plot import DrawingSpec, ReviewPlot
 from plushsense.studio.pages.review.signals import GestureOverlay
 from plushsense.studio.widgets.elements import link, table
 
@@ -89,16 +89,16 @@ class GestureOverlayView:
             "{gesture}: recordings {n}, outliers {odd}.", n=len(overlay.drawn), odd=len(outliers), gesture=gesture
         )
         self.summary.set_text(summary if overlay.drawn else words("There is nothing to draw yet."))
-        self.plot.show(
+        drawing = DrawingSpec(
             f"overlay {self._gesture}",
             summary,
-            np.round(overlay.x, 4).tolist(),
-            curves,
+            [np.round(overlay.x, 4).tolist(), *curves],
             series,
             x_title=words("Seconds since the first row (grey: outside the recording)"),
             y_title=words("Deviation from rest (1 = usual)"),
             limits=(0.0, overlay.top),
         )
+        self.plot.show(drawing)
         self.names.clear()
         with self.names:
             if not outliers:
@@ -211,11 +211,10 @@ class DurationsView:
         seconds = [(s, i in outliers) for i, s in band.seconds.items()]
         points = [[s if odd is out else None for s, odd in seconds] for out in (False, True)]
         lines = [[value] * n for value in (band.mean_s, band.low_s, band.high_s)]
-        self.plot.show(
+        drawing = DrawingSpec(
             f"durations {band.gesture}",
             summary,
-            list(range(1, n + 1)),
-            [*points, *lines],
+            [list(range(1, n + 1)), *points, *lines],
             [
                 {"label": "", "stroke": _INSIDE, "dots": True},
                 {"label": "", "stroke": _OUTSIDE, "dots": True},
@@ -227,6 +226,7 @@ class DurationsView:
             limits=(0.0, 1.08 * max(band.high_s, band.statistics.max)),
             bands=[{"series": [5, 4], "fill": "rgba(0,114,178,0.14)"}],
         )
+        self.plot.show(drawing)
 
     def _list(self) -> None:
         words, band = self.desk.words, self._band

@@ -10,7 +10,7 @@ from nicegui import ui
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, button, icon_button, named, tag
 from plushsense.studio.app.words import CHANNEL_KINDS, Texts, in_context
 from plushsense.studio.pages.review.controller import ReviewController
-from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
+from plushsense.studio.pages.review.plot import DrawingSpec, ReviewPlot, curve_styles
 from plushsense.studio.pages.review.review import STATE_TEXTS
 from plushsense.studio.pages.review.signals import ACTIVITY, ALL
 from plushsense.studio.pages.review.table_view import (
@@ -162,11 +162,10 @@ class RecordingView:
         series = curve_styles([self._kind(n) if n == ACTIVITY else words.channel(n) for n in plotted.names])
         y_title = words("Value ({unit})", unit=words.unit(plotted.unit)) if plotted.unit else ""
         lanes = [(at, self._kind(kind)) for at, kind in plotted.lanes]
-        self.plot.show(
+        drawing = DrawingSpec(
             identity,
             self._label(),
-            plotted.x,
-            plotted.curves,
+            [plotted.x, *plotted.curves],
             series,
             x_title=words("Seconds since the first row (grey: outside the recording)"),
             y_title=words("Deviation from rest (1 = usual)") if self.group == ACTIVITY else y_title,
@@ -177,6 +176,7 @@ class RecordingView:
             thinned=plotted.thinned or low is not None,
             keep=keep,
         )
+        self.plot.show(drawing)
         self.refresh()
 
     def refresh(self) -> None:

@@ -10,7 +10,7 @@ from plushsense.dataset.marks import HANDLING, PRACTICE, REST
 from plushsense.studio.app.shell import button, icon_button, tag
 from plushsense.studio.app.words import CHANNEL_KINDS, Texts
 from plushsense.studio.pages.review.controller import ReviewController
-from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
+from plushsense.studio.pages.review.plot import DrawingSpec, ReviewPlot, curve_styles
 from plushsense.studio.pages.review.signals import ALL, RecordingSignals
 
 _LABELS: Texts = {
@@ -96,11 +96,10 @@ class StreamView:
                 return
             plotted = signals.curves(ALL, low, high)
             lanes = [(at, words(CHANNEL_KINDS.get(kind, kind))) for at, kind in plotted.lanes]
-            self.plot.show(
+            drawing = DrawingSpec(
                 stream,
                 self._about(signals),
-                plotted.x,
-                plotted.curves,
+                [plotted.x, *plotted.curves],
                 curve_styles([words.channel(n) for n in plotted.names]),
                 x_title=words("Seconds since the first row of the stream"),
                 y_title=words("Value ({unit})", unit=words.unit(plotted.unit)) if plotted.unit else "",
@@ -110,6 +109,7 @@ class StreamView:
                 thinned=plotted.thinned or low is not None,
                 keep=low is not None,
             )
+            self.plot.show(drawing)
             self._drawn = None
             self._update(signals)
 
