@@ -137,10 +137,9 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, tmp_path: Pa
     assert marked(page, "do").is_disabled()
     page.goto(f"{url}/export?model={home / 'bundles' / 'fine.plush'}")
     connected(page)
-    for name, said in (("taken", "exists already"), ("../out", "cannot be a name"), ("", "cannot be a name")):
-        marked(page, "name").fill(name)
-        marked(page, "do").click()
-        marked(page, "new").get_by_role("alert").get_by_text(said).wait_for()
+    marked(page, "name").fill("taken")
+    marked(page, "do").click()
+    marked(page, "new").get_by_role("alert").get_by_text("exists already").wait_for()
     # A home that cannot be written to, for root too.
     (home / "exports" / "taken").rmdir()
     (home / "exports").rmdir()

@@ -14,8 +14,6 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.trimming import row_times_s, suggest_trims
-from plushsense.studio.app.selections import Selections
-from plushsense.studio.app.workspace import Workspace
 from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
 from support.reviewed import ROW_S, made, marks, raw_hash, streamed
 
@@ -466,35 +464,6 @@ def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixtu
     # Where all others have ended, only one is left.
     over.click(position={"x": int(box["width"] * 0.75), "y": int(box["height"] * 0.5)})
     assert opened(page) == longest
-
-
-@pytest.mark.exhaustive
-def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> None:
-    started = studio(home=waves.parents[1])
-    ids = [r.id for r in open_dataset(waves).recordings if r.gesture == "Wave"]
-    reviews = Selections(Workspace(waves.parents[1]))
-    browser = look()
-    page = browser.open(started.url + reviews.address(waves, ids[3:6], "Wave taken for Rest"))
-    page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 3")
-    assert "Only the linked recordings (3). Wave taken for Rest" in marked(page, "selection").inner_text()
-    marked(page, "start").click()
-    assert opened(page) == ids[3]
-    checked(page)
-    pressed(page, "Enter")
-    pressed(page, "Enter")
-    page.keyboard.press("Enter")
-    page.get_by_text("the last recording of this list").wait_for()
-    assert [m["recording"] for m in marks(waves)] == ids[3:6]
-    page = browser.open(started.url + reviews.address(waves, [*ids, *(f"P9/gone_{i}" for i in range(99))], "many"))
-    page.wait_for_function(f"() => document.querySelectorAll('[data-test=table] tbody tr').length === {len(ids)}")
-    assert "not in this data set: 99" in marked(page, "message").inner_text()
-    page = browser.open(started.url + "/review?recording=P1/none")
-    page.get_by_text("There is no recording “P1/none”").wait_for()
-    page = browser.open(started.url + "/review?selection=0000")
-    page.get_by_text("The selection “0000” does not exist").wait_for()
-    page = browser.open(started.url + "/review?dataset=/etc")
-    page.get_by_text("is not in the studio's folder").wait_for()
-    assert browser.complaints == []
 
 
 def test_a_folder_that_cannot_be_written(waves: Path, studio: Fixture, look: Fixture) -> None:

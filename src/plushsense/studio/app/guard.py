@@ -10,27 +10,22 @@ import io
 import ipaddress
 import secrets
 import zipfile
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Iterable
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 from fastapi import APIRouter
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from jinja2 import ChoiceLoader, DictLoader, Environment
 from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.importing.archives import zip_entry
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.deploy.code import FACTS
 from plushsense.studio.app.workspace import BACKUPS, EXPORTS, PACKAGES, Workspace
-
-Scope = dict[str, Any]
-Receive = Callable[[], Awaitable[dict[str, Any]]]
-Send = Callable[[dict[str, Any]], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 COOKIE = "plushsense_visitor"
 TOKEN = "token"
@@ -148,7 +143,7 @@ class Visitors:
 class Guard:
     """ASGI middleware that rejects browsers not admitted by `Visitors`, limits bodies and sets security headers."""
 
-    def __init__(self, app: App, visitors: Visitors) -> None:
+    def __init__(self, app: ASGIApp, visitors: Visitors) -> None:
         self._app, self._visitors = app, visitors
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -179,7 +174,7 @@ class Guard:
 _TOKEN_NEEDED = "This studio can only be opened with the address that it printed at start; its token is valid once."
 
 
-async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
+async def _bounded(app: ASGIApp, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
     """Call ``app``, limit the size of the request body (even if its length is unknown) and add security headers."""
     limit = UPLOAD_BYTES if _is_upload(scope) else BODY_BYTES
     refusal = f"This is larger than the {limit / 1e6:g} MB that are accepted here."
@@ -190,7 +185,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
     received, too_large, started, disconnected = 0, False, False, False
     scope[NONCE] = nonce = secrets.token_urlsafe(16)
 
-    async def receiving() -> dict[str, Any]:
+    async def receiving() -> Message:
         nonlocal received, too_large, disconnected
         if too_large:
             return {"type": "http.disconnect"}
@@ -202,7 +197,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
             return {"type": "http.disconnect"}
         return message
 
-    async def sending(message: dict[str, Any]) -> None:
+    async def sending(message: Message) -> None:
         nonlocal started
         if too_large and not started:
             return
@@ -254,7 +249,7 @@ async def _answer(scope: Scope, send: Send, response: Response) -> None:
     await response(scope, _nothing, send)
 
 
-async def _nothing() -> dict[str, Any]:
+async def _nothing() -> Message:
     return {"type": "http.disconnect"}
 
 

@@ -90,10 +90,6 @@ class Words:
         form = forms[self._plural_form(n)] if isinstance(forms, tuple) else many if n != 1 else one
         return form.rpartition(_CONTEXT)[2].format(n=n)
 
-    def knows(self, text: str) -> bool:
-        """Return whether there is a translation of an English text."""
-        return bool(self._translation(text))
-
     def _translation(self, text: str) -> str | tuple[str, ...]:
         context, _, text = text.rpartition(_CONTEXT)
         message = self._catalog.get(text, context or None)
