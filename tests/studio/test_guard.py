@@ -325,6 +325,15 @@ def test_abroad_nothing_answers_without_a_token(nicegui: str, studio: Fixture, t
     assert not [p for p in tmp_path.rglob("*") if p.is_file() and token.encode() in p.read_bytes()]
 
 
+def test_bodies_are_bounded_on_every_route(studio: Fixture) -> None:
+    one = studio()
+
+    for path in ("/", "/_nicegui_ws/socket.io/?EIO=4&transport=polling", "/nothing"):
+        assert get(one, path, "POST", content_length=str(BODY_BYTES + 1))[0] == 413
+    assert get(one, "/_nicegui/client/x/upload/1", "POST", iter([b"x" * 1_000_000] * 2))[0] in (404, 405)
+    assert get(one, "/")[0] == 200
+
+
 def test_a_tablet_comes_in_by_its_address_once(studio: Fixture, look: Fixture) -> None:
     one = studio("--host", "0.0.0.0")
     query = urlsplit(one.url).query
