@@ -109,15 +109,7 @@ def main() -> int:
     except PlushSenseError as refusal:
         say(f"bench/exactness.py: {refusal}")
         return 2
-    if args.json:
-        print(json.dumps(report))
-        return 0
-    print(f"{report['title']}: {report['windows']} windows of {', '.join(report['people'])}, who were not trained on")
-    print(f"{'':<47}{'as float':>10}{'error':>8}")
-    for name, row in report["rows"].items():
-        print(f"{name:<47}{100 * row['agreement']:>8.1f} %{100 * row['logit_error']:>6.1f} %")
-    for name, reason in report["absent"].items():
-        print(f"{name:<47}  {reason}")
+    print(json.dumps(report, indent=None if args.json else 1))
     return 0
 
 

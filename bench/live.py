@@ -116,26 +116,7 @@ def main() -> None:
     report["many"] = many(bundle, args.toys, args.seconds) if args.toys else None
     report["load"] = [round(v, 2) for v in os.getloadavg()] if hasattr(os, "getloadavg") else None
     report["cores"] = os.cpu_count()
-    if args.json:
-        print(json.dumps(report))
-        return
-    print(f"{report['network']}, a step of {step_ms:g} ms; load {report['load']} on {report['cores']} cores\n")
-    for engine, one in report["bytes_to_event"].items():
-        for clock, of in (("ms", "on the wall"), ("processor_ms", "of the processor")):
-            ms = one[clock]
-            print(
-                f"bytes to event, {engine:<6} p50 {ms['p50']} ms, p95 {ms['p95']} ms, p99 {ms['p99']} ms, longest "
-                f"{ms['longest']} ms {of}, {one['steps']} steps"
-            )
-        print(f"{'':<22} {one['us_a_frame']} µs of processor time per frame")
-    if report["many"]:
-        one = report["many"]
-        ms = one["latency_ms"]
-        print(
-            f"\n{one['toys']} virtual toys at 100 Hz in one thread for {one['wall_s']} s: {one['decisions']} "
-            f"decisions, {one['late']} late; p50 {ms['p50']} ms, p99 {ms['p99']} ms, longest {ms['max']} ms; "
-            f"{100 * one['busy']:.0f} % of a core"
-        )
+    print(json.dumps(report, indent=None if args.json else 1))
 
 
 if __name__ == "__main__":

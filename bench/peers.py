@@ -1,14 +1,14 @@
 """Measure the cost of one decision every 50 ms: our C against the same network in other runtimes.
 
-    THERE/bin/pip install tflite-micro ai-edge-litert ai-edge-quantizer torch==2.13.0 executorch onnxruntime onnx
-    python bench/peers.py --python THERE/bin/python --onnx2c PATH --cmsis-nn DIR [--save]
+    THERE/bin/pip install tflite-micro ai-edge-litert ai-edge-quantizer onnxruntime onnx
+    python bench/peers.py --python THERE/bin/python --cmsis-nn DIR [--save]
 
 Install the other runtimes in an environment of their own (they install PyTorch and other large packages); `--python`
-names its interpreter (default: the one that runs this program). `--onnx2c` is the program built from
-github.com/kraiskil/onnx2c, `--cmsis-nn` a copy of github.com/ARM-software/CMSIS-NN. What is missing is listed with how
-to get it, and the rest is measured. gcc is required, valgrind with its headers to count instructions, and
-gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm for the Cortex-M4. `--save` measures the two networks of
-docs/measurements/peers.md, and writes bench/peers.json and from it the tables of the page.
+names its interpreter (default: the one that runs this program). `--cmsis-nn` is a copy of
+github.com/ARM-software/CMSIS-NN. What is missing is listed with how to get it, and the rest is measured. gcc is
+required, valgrind with its headers to count instructions, and gcc-arm-none-eabi, libnewlib-arm-none-eabi and
+qemu-system-arm for the Cortex-M4. `--save` measures the two networks of docs/measurements/peers.md, and writes
+bench/peers.json and from it the tables of the page.
 
 Every runtime gets the same weights, with the normalisation folded in, quantized by its own tool on the same decisions,
 and two graphs. That of the `stream` is our algorithm: it computes the 5 new samples of a step, and has each layer's
@@ -59,11 +59,10 @@ LITERT = "ai-edge-litert ai-edge-quantizer"
 PEERS: dict[str, tuple[str, str]] = {
     "tflite-micro": ("TensorFlow Lite Micro, int8, reference kernels", f"tflite-micro {LITERT}"),
     "litert": ("LiteRT, int8, XNNPACK", LITERT),
-    "executorch": ("ExecuTorch, int8, XNNPACK", "executorch"),
     "onnxruntime": ("onnxruntime, float", "onnxruntime onnx"),
     "onnxruntime-int8": ("onnxruntime, int8 (QDQ)", "onnxruntime onnx"),
 }
-C_PEERS = ("onnx2c", "plain", "cmsis-nn")
+C_PEERS = ("cmsis-nn",)
 ALGORITHMS = ("stream", "window")
 NETWORKS = {"paper": "14d1_39d2_41d4", "default": "14d1_19d2_19d4"}
 
@@ -91,8 +90,6 @@ def python_entry(peer: str, algorithm: str, python: str, shop: Workshop) -> Entr
     """Return the entry of a Python runtime."""
     title, packages = PEERS[peer]
     facts = made(peer, packages, algorithm, python, shop)
-    if facts.get("outside_xnnpack"):
-        title += f", {len(facts['outside_xnnpack'])} operators outside"
     return Entry(
         title, algorithm, [python, str(WORKER), "run", peer, algorithm, str(shop.folder)], facts["model_bytes"],
         memory_bytes=facts.get("memory_bytes"), versions=facts["versions"],
@@ -111,12 +108,6 @@ def entries(args: argparse.Namespace, case: Case, shop: Workshop) -> tuple[list[
         except (CannotBuild, PlushSenseError) as reason:
             absent[f"{name}, {algorithm}"] = str(reason)
 
-    def onnx2c(algorithm: str) -> Entry:
-        model = shop.folder / f"onnxruntime-{algorithm}.model"
-        if not model.exists():
-            made("onnxruntime", "onnx", algorithm, args.python, shop)
-        return programs.onnx2c(case, shop, algorithm, args.onnx2c, model)
-
     def cmsis_nn(algorithm: str) -> ChipRow:
         root = programs.require_cmsis_nn(Path(args.cmsis_nn) if args.cmsis_nn else None)
         facts = made("cmsis-nn", LITERT, algorithm, args.python, shop)
@@ -128,14 +119,8 @@ def entries(args: argparse.Namespace, case: Case, shop: Workshop) -> tuple[list[
     for algorithm in ALGORITHMS:
         for peer in (p for p in PEERS if p in peers):
             attempt(found, PEERS[peer][0], algorithm, python_entry, peer, algorithm, args.python, shop)
-        if "plain" in peers:
-            attempt(found, "plain float C", algorithm, programs.plain_loops, case, shop, algorithm)
-        if "onnx2c" in peers:
-            attempt(found, "onnx2c float C", algorithm, onnx2c, algorithm)
         if chip:
             attempt(chip, "CMSIS-NN int8", algorithm, cmsis_nn, algorithm)
-        if chip and (shop.folder / f"onnx2c-{algorithm}.c").exists():
-            attempt(chip, "onnx2c on the Cortex-M4", algorithm, programs.onnx2c_on_chip, case, shop, algorithm)
     return found, [row for part in chip for row in (part if isinstance(part, list) else [part])], absent
 
 
@@ -248,7 +233,6 @@ def main() -> int:
     parser.add_argument("--bundle", help="a trained network in place of random weights")
     parser.add_argument("--form", choices=FORMS, default="cheapest", help="what the graph of the window reads")
     parser.add_argument("--python", default=sys.executable, help="interpreter that has the other runtimes")
-    parser.add_argument("--onnx2c", default="onnx2c", help="the program onnx2c")
     parser.add_argument("--cmsis-nn", help="folder of CMSIS-NN's sources")
     parser.add_argument("--cc", default="gcc")
     parser.add_argument("--only", help=f"of {','.join((*PEERS, *C_PEERS))}; 'none': ours alone")

@@ -1,8 +1,7 @@
 """Measure the cost of a live decision: a network that keeps its state against one that recomputes its window.
 
 Both run in the NumPy reference on one thread, in turn, on the same samples. Times are of the processor, and ratios are
-taken within a round, so that other programs and slow changes of the machine's speed have little effect. The numbers of
-multiply-accumulates are printed beside the times.
+taken within a round, so that other programs and slow changes of the machine's speed have little effect.
 
     python bench/streaming.py [--rounds 15] [--json]
 """
@@ -62,16 +61,7 @@ def main() -> None:
                 "times_faster": [round(r, 2) for r in (ratios[0], statistics.median(ratios), ratios[-1])],
             }
         )
-    if args.json:
-        print(json.dumps(rows))
-        return
-    print(f"{'network':<18}{'MAC/step':>12}{'fewer':>8}{'µs/decision':>15}   times faster (min, median, max)")
-    for row in rows:
-        low, middle, high = row["times_faster"]
-        print(
-            f"{row['network']:<18}{row['macs_per_step']:>12,}{row['macs_ratio']:>7}×{row['us_a_decision']:>15}"
-            f"   {low} {middle} {high}"
-        )
+    print(json.dumps(rows, indent=None if args.json else 1))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure the live page: updates a second, processor time of the server, bytes to page, memory over a long run.
 
-    python bench/studio.py --model BUNDLE [--seconds 30] [--minutes 10 --speed 6] [--soak-hours 1] [--json]
+    python bench/studio.py --model BUNDLE [--seconds 30] [--minutes 10 --speed 6] [--json]
 
 A virtual toy in a process of its own (13 channels, 100 Hz) sends over TCP; the studio reads it in another; Chromium,
 headless, shows the page. All three and this program share the machine, whose load is reported with the results.
@@ -10,7 +10,6 @@ headless, shows the page. All three and this program share the machine, whose lo
    to the end of drawing it, all by the clock of the machine.
 2. Memory, for `--minutes` of the toy's time at `--speed`: resident memory of the studio and heap of the page, after a
    forced garbage collection, every few seconds; the growth is the slope of a straight line through the last two thirds.
-   `--soak-hours` does the same in real time for that many hours.
 
 Linux (/proc), Debian's Chromium and Playwright are required. Only the lines of the virtual toy matter here, not its
 scores.
@@ -156,7 +155,7 @@ def memory(page: Any, pid: int, seconds: float, every_s: float = 5.0) -> dict[st
     }
 
 
-def measure(model: Path, speed: float, seconds: float, watched: str, tabs: int = 1) -> dict[str, Any]:
+def measure(model: Path, speed: float, seconds: float, watched: str) -> dict[str, Any]:
     """Measure one toy, one studio and one browser: ``watched`` is "real" or "memory"."""
     from playwright.sync_api import sync_playwright
 
@@ -173,8 +172,6 @@ def measure(model: Path, speed: float, seconds: float, watched: str, tabs: int =
                 page = browser.new_page(viewport={"width": 1280, "height": 900})
                 page.goto(f"{studio.url}/live")
                 begin(page)
-                for _ in range(tabs - 1):
-                    browser.new_page().goto(f"{studio.url}/live")
                 time.sleep(5.0)
                 take = at_real_time if watched == "real" else memory
                 result = take(page, studio.process.pid, seconds)
@@ -182,7 +179,7 @@ def measure(model: Path, speed: float, seconds: float, watched: str, tabs: int =
         finally:
             studio.end()
             toy.end()
-    return result | {"speed": speed, "tabs": tabs}
+    return result | {"speed": speed}
 
 
 def main() -> None:
@@ -193,22 +190,14 @@ def main() -> None:
         "--minutes", type=float, default=10.0, help="duration of the second part in toy time (10); 0: none"
     )
     parser.add_argument("--speed", type=float, default=6.0, help="speed of the second part, times real time (6)")
-    parser.add_argument("--soak-hours", type=float, default=0.0, help="duration of a soak test in real time (0)")
-    parser.add_argument("--tabs", type=int, default=1, help="pages open at the same time (1)")
     parser.add_argument("--json", action="store_true", help="one JSON object, nothing else")
     args = parser.parse_args()
     result: dict[str, Any] = {"cores": os.cpu_count()}
     if args.seconds > 0:
-        result["real_time"] = measure(args.model, 1.0, args.seconds, "real", args.tabs)
+        result["real_time"] = measure(args.model, 1.0, args.seconds, "real")
     if args.minutes > 0:
-        result["memory"] = measure(args.model, args.speed, 60.0 * args.minutes / args.speed, "memory", args.tabs)
-    if args.soak_hours > 0:
-        result["soak"] = measure(args.model, 1.0, 3600.0 * args.soak_hours, "memory", args.tabs)
-    if args.json:
-        print(json.dumps(result))
-        return
-    for part, values in result.items():
-        print(f"{part}: {json.dumps(values)}")
+        result["memory"] = measure(args.model, args.speed, 60.0 * args.minutes / args.speed, "memory")
+    print(json.dumps(result, indent=None if args.json else 1))
 
 
 if __name__ == "__main__":

@@ -15,10 +15,8 @@ import argparse
 import json
 import math
 import multiprocessing
-import platform
 import sys
 import time
-from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -180,11 +178,6 @@ def steps(args: argparse.Namespace) -> None:
     clock = time.process_time if beside is None else time.perf_counter
     plain_s = ours_s = 0.0
     rows: list[dict[str, Any]] = []
-    say = partial(print, file=sys.stderr if args.json else sys.stdout, flush=True)
-    say(f"{platform.machine()}, {args.cores} core(s), torch {torch.__version__}; the fastest of interleaved steps")
-    if beside is not None:
-        say(f"plain: one training on {args.cores} threads; ours: {args.cores} trainings side by side, a thread each")
-    say(f"{'network':38s} {'batch':>5s} {'plain ms':>9s} {'ours ms':>9s} {'ratio':>6s} {'MB':>6s}")
     for arch in networks(filters):
         for batch in batches:
             loops = Loops(arch, x, y, batch, args.cores)
@@ -213,21 +206,11 @@ def steps(args: argparse.Namespace) -> None:
             plain_s += plain * each
             ours_s += ours * each
             rows.append({"network": named(arch), "batch": batch, "plain_s": plain, "ours_s": ours})
-            say(
-                f"{named(arch):38s} {batch:5d} {1e3 * plain:9.1f} {1e3 * ours:9.1f} {plain / ours:6.2f} "
-                f"{loops.fast.plan.bytes / 1e6:6.0f}",
-            )
     if beside is not None:
         beside.close()
     hours = {"plain": plain_s * APART / 3600, "ours": ours_s * NESTED / 3600}
-    if args.json:
-        print(json.dumps({"rows": rows, "step_ratio": plain_s / ours_s, "hours": hours}))
-        return
-    print(f"an epoch of everything: plain {plain_s:.1f} s, ours {ours_s:.1f} s")
-    print(f"step for step:                       {plain_s / ours_s:.2f} times less")
-    print(f"nested epochs (1350 → 1000):         {APART / NESTED:.2f} times less")
-    print(f"the whole grid:                      {hours['plain'] / hours['ours']:.2f} times less")
-    print(f"in hours: plain {hours['plain']:.1f}, ours {hours['ours']:.1f}")
+    found = {"rows": rows, "step_ratio": plain_s / ours_s, "hours": hours, "torch": torch.__version__}
+    print(json.dumps(found, indent=None if args.json else 1))
 
 
 def main() -> int:

@@ -1,10 +1,8 @@
-"""Programs in C to compare: PlushSense, plain loops, the output of onnx2c, CMSIS-NN."""
+"""Programs in C to compare: PlushSense, and CMSIS-NN on an emulated chip."""
 
 from __future__ import annotations
 
-import shutil
 import subprocess
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -12,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from opponents.case import Case
-from opponents.tables import LOOPS_ROW, ONNX2C_ROW, OUR_ROW, PLAIN_ROW, WHOLE_ROW
+from opponents.tables import OUR_ROW, PLAIN_ROW, WHOLE_ROW
 
 from plushsense.deploy import profile
 from plushsense.deploy.code import read_facts
@@ -128,64 +126,6 @@ def _asking(shop: Workshop, sources: Path) -> list[str]:
     return [str(out)]
 
 
-def _table(name: str, values: NDArray[np.float32]) -> str:
-    numbers = ", ".join(f"{float(v):.9g}f" if "." in f"{float(v):.9g}" else f"{float(v):.9e}f" for v in values.ravel())
-    return f"static const float {name}[{values.size}] = {{{numbers}}};\n"
-
-
-def _header(case: Case, algorithm: str) -> str:
-    arch, w, stream = case.arch, case.weights, algorithm == "stream"
-    length = arch.step if stream else case.length
-    numbers = {"STREAM": int(stream), "CHANNELS": arch.channels, "WINDOW": length}
-    text, calls, room = "", [], length * arch.channels
-    for i, (layer, read) in enumerate(zip(arch.layers, arch.inputs, strict=True)):
-        text += _table(f"w{i}", np.ascontiguousarray(w[f"w{i}"].transpose(2, 1, 0))) + _table(f"b{i}", w[f"b{i}"])
-        rows = layer.reach if stream or case.form == "window" else 0
-        text += f"static float kept{i}[{max(1, rows * read)}];\n"
-        calls += [f"before({rows}, {length}, {read}, kept{i});"]
-        room = max(room, (rows + length) * read)
-        length += rows - layer.reach
-        room = max(room, length * layer.filters)
-        calls += [f"layer({length}, {read}, {layer.filters}, {layer.kernel}, {layer.dilation}, w{i}, b{i});"]
-    text += _table("dense_w", w["dense_w"]) + _table("dense_b", w["dense_b"])
-    # onnx2c's function takes all inputs and then all outputs of the graph.
-    sizes = [values[0].size for name, values in case.calibration[algorithm].items() if name != "x"]
-    at = np.cumsum([0, *sizes]).tolist()
-    before, after = ([f"{name} + {n}" for n in at[:-1]] for name in ("before", "after"))
-    numbers |= {
-        "CLASSES": arch.classes, "FEATURES": arch.filters[-1], "POSITIONS": length,
-        "BLOCKS": arch.pooled // arch.step if stream else 1, "ROOM": room, "MOST_FILTERS": max(arch.filters),
-        "STATES": max(1, at[-1]),
-    }  # fmt: skip
-    words = {
-        "LAYERS": " ".join(calls), "CALL": ", ".join(["x", *before, "logits", *after]),
-        "ENTRY": ", ".join([*["const void *"] * (1 + len(sizes)), *["void *"] * (1 + len(sizes))]),
-    }  # fmt: skip
-    return "".join(f"#define {name} {value}\n" for name, value in (numbers | words).items()) + text
-
-
-def plain_loops(case: Case, shop: Workshop, algorithm: str) -> Entry:
-    """Build the float C of this bench: simple loops."""
-    (shop.folder / "network.h").write_text(_header(case, algorithm))
-    built = shop.compiled(HERE / "floats.c", f"plain-{algorithm}", "-O2", *STRICT, "-Wno-unused-variable")
-    command = shop.program(f"run-plain-{algorithm}", [built])
-    return Entry(LOOPS_ROW, algorithm, command, None, *_sizes(built))
-
-
-def onnx2c(case: Case, shop: Workshop, algorithm: str, tool: str, model: Path) -> Entry:
-    """Build what onnx2c generates from ``model``."""
-    found = shutil.which(tool)
-    if found is None:
-        raise CannotBuild("onnx2c was not found: build github.com/kraiskil/onnx2c and give --onnx2c PATH")
-    source = shop.folder / f"onnx2c-{algorithm}.c"
-    source.write_text(_call([found, str(model)], shop.folder))
-    (shop.folder / "network.h").write_text(_header(case, algorithm))
-    network = shop.compiled(source, f"onnx2c-{algorithm}", "-O3")
-    caller = shop.compiled(HERE / "floats.c", f"call-onnx2c-{algorithm}", "-O3", "-DONNX2C")
-    command = shop.program(f"run-onnx2c-{algorithm}", [network, caller])
-    return Entry(ONNX2C_ROW, algorithm, command, None, *_sizes(network))
-
-
 # ---- An emulated Cortex-M4 --------------------------------------------------------------------------------------
 
 CHIP = "cortex-m4"
@@ -237,33 +177,16 @@ def cmsis_nn(
     case: Case, shop: Workshop, algorithm: str, root: Path, header: Path, logits: tuple[float, int]
 ) -> ChipRow:
     """Count CMSIS-NN with the integers in ``header``; ``logits`` are their scale and zero."""
-    (shop.folder / "integers.h").write_bytes(header.read_bytes())
     parts = [(root / "Source" / f"{kind}Functions", names) for kind, names in CMSIS_NN.items()]
-    sources = [HERE / "cmsis.c", *(folder / f"{name}.c" for folder, names in parts for name in names)]
-    row = _on_chip(case, shop, sources, header.with_suffix(".bin"), algorithm, 1, include=[root / "Include"])
-    return ChipRow("CMSIS-NN int8 -O3", algorithm, row[0], (row[1].view(np.int8) - float(logits[1])) * logits[0])
-
-
-def onnx2c_on_chip(case: Case, shop: Workshop, algorithm: str) -> ChipRow:
-    """Count the C that `onnx2c` wrote, with the floating-point unit."""
-    (shop.folder / "network.h").write_text(_header(case, algorithm))
-    sources = [shop.folder / f"onnx2c-{algorithm}.c", HERE / "floats.c"]
-    flags = ["-DONNX2C", "-mfpu=fpv4-sp-d16", "-mfloat-abi=softfp"]
-    row = _on_chip(case, shop, sources, shop.folder / f"{algorithm}.bin", algorithm, 4, flags=flags)
-    return ChipRow(ONNX2C_ROW, algorithm, row[0], row[1].view("<f4").astype(np.float64))
-
-
-def _on_chip(
-    case: Case, shop: Workshop, sources: Sequence[Path], inputs: Path, algorithm: str, size: int,
-    *, include: Sequence[Path] = (), flags: Sequence[str] = (),
-) -> tuple[float, NDArray[np.uint8]]:  # fmt: skip
-    """Run `chip.c`; return the mean of instructions, and the bytes of the logits, ``size`` each."""
-    each = size * case.arch.channels * (case.arch.step if algorithm == "stream" else case.length)
-    held, logits = shop.folder / "inputs.bin", size * case.arch.classes
-    held.write_bytes(inputs.read_bytes()[: None if algorithm == "stream" else CHIP_WINDOWS * each])
+    sources = [HERE / "chip.c", HERE / "cmsis.c", *(folder / f"{name}.c" for folder, names in parts for name in names)]
+    each = case.arch.channels * (case.arch.step if algorithm == "stream" else case.length)
+    (shop.folder / "integers.h").write_bytes(header.read_bytes())
+    held, read = shop.folder / "inputs.bin", header.with_suffix(".bin").read_bytes()
+    held.write_bytes(read[: None if algorithm == "stream" else CHIP_WINDOWS * each])
     program = build(
-        CHIP, [HERE / "chip.c", *sources], shop.folder / "chip", include=[shop.folder, *include], optimise="-O3",
-        defines={"INPUT_BYTES": each, "LOGIT_BYTES": logits}, blobs={"INPUTS": held}, flags=flags,
+        CHIP, sources, shop.folder / "chip", include=[shop.folder, root / "Include"], optimise="-O3",
+        defines={"INPUT_BYTES": each, "LOGIT_BYTES": case.arch.classes}, blobs={"INPUTS": held},
     )  # fmt: skip
-    rows = np.frombuffer(program.run(timeout_s=600), dtype=np.uint8).reshape(-1, 4 + logits)
-    return float(rows[:, :4].copy().view("<u4").mean()), rows[:, 4:].copy()
+    rows = np.frombuffer(program.run(timeout_s=600), dtype=np.uint8).reshape(-1, 4 + case.arch.classes)
+    counted, integers = rows[:, :4].copy().view("<u4"), rows[:, 4:].copy().view(np.int8)
+    return ChipRow("CMSIS-NN int8 -O3", algorithm, float(counted.mean()), (integers - float(logits[1])) * logits[0])

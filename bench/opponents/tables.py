@@ -10,8 +10,6 @@ from plushsense.reports.table import Table, percent
 OUR_ROW = "PlushSense C -O2, network only"
 WHOLE_ROW = "PlushSense C -O2, frames to answer"
 PLAIN_ROW = f"{WHOLE_ROW}, plain C"
-ONNX2C_ROW = "onnx2c float C -O3"
-LOOPS_ROW = "plain float C of this bench -O2"
 AIM = 1.5  # least ratio of a peer's cost to that of our network, on the same algorithm
 FAITHFUL = 0.8  # share of decisions that equal the float ones, below which a runtime is reported as broken
 
@@ -101,20 +99,10 @@ def verdict(report: dict[str, Any]) -> str:
                 counted += [f"{row['name']}{title} ({ratio:.2f})"] if ratio < AIM else []
             if row.get("times_slower", AIM) < AIM:
                 slow.append(f"{row['name']} ({row['times_slower']:.2f})")
-    text = (
+    return (
         f"Aim: every peer takes at least {AIM:g} times as much as our network with the same algorithm. Below it by "
         f"instructions: {', '.join(counted) or 'none'}; by time: {', '.join(slow) or 'none'}."
     )
-    of = {row["name"]: row["instructions"] for row in report["rows"] if row["reads"] != "window"}
-    portable = [
-        f"{name} {times}" for name in (ONNX2C_ROW, LOOPS_ROW) if (times := _times(of.get(name), of.get(PLAIN_ROW)))
-    ]
-    if portable:
-        text += (
-            " Portable C against portable C, in instructions of our plain C, which does all that a toy does: "
-            f"{', '.join(portable)}."
-        )
-    return text
 
 
 def lines(report: dict[str, Any]) -> Iterator[str]:

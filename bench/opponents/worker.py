@@ -264,101 +264,6 @@ def tflite_model(
     )  # fmt: skip
 
 
-# ---- ExecuTorch -------------------------------------------------------------------------------------------------
-
-
-def make_executorch(case: Case, path: Path) -> Facts:
-    import torch
-    from executorch.backends.xnnpack.partition.xnnpack_partitioner import XnnpackPartitioner
-    from executorch.backends.xnnpack.quantizer.xnnpack_quantizer import (
-        XNNPACKQuantizer,
-        get_symmetric_quantization_config,
-    )
-    from executorch.exir import to_edge_transform_and_lower
-    from torchao.quantization.pt2e.quantize_pt2e import convert_pt2e, prepare_pt2e
-
-    names = list(states_of(case))
-
-    class Graph(torch.nn.Module):  # type: ignore[misc]
-        """The network from (1, C, 1, T) and states to (1, K) and states."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            layers: list[torch.nn.Module] = []
-            for i in range(int(case["layers"])):
-                w, dilation = case[f"w{i}"], int(case[f"dilation{i}"])
-                conv = torch.nn.Conv2d(w.shape[1], len(w), (1, w.shape[2]), dilation=(1, dilation))
-                conv.weight.data = torch.tensor(w[:, :, None])
-                conv.bias.data = torch.tensor(case[f"b{i}"])
-                pad = torch.nn.ZeroPad2d(((w.shape[2] - 1) * dilation if case["padded"] else 0, 0, 0, 0))
-                layers.append(torch.nn.Sequential(*([pad] if case["padded"] else []), conv, torch.nn.ReLU()))
-            self.layers = torch.nn.ModuleList(layers)
-            self.dense = torch.nn.Linear(case["dense_w"].shape[1], len(case["dense_w"]))
-            self.dense.weight.data = torch.tensor(case["dense_w"])
-            self.dense.bias.data = torch.tensor(case["dense_b"])
-
-        def forward(self, z: Any, *states: Any) -> Any:
-            before, after = dict(zip(names, states, strict=True)), []
-
-            def with_state(name: str, z: Any) -> Any:
-                whole = torch.cat([before[name], z], 3)
-                after.append(whole[..., z.shape[3] :])
-                return whole
-
-            for i, layer in enumerate(self.layers):
-                z = layer(with_state(f"history{i}", z) if f"history{i}" in before else z)
-            if "blocks" in before:
-                z = with_state("blocks", z.mean((2, 3), keepdim=True))
-            return self.dense(z.mean((2, 3), keepdim=True).flatten(1)), *after
-
-    module = Graph().eval()
-    rows = list(zip(*(case[f"calibration.{name}"] for name in ("x", *names)), strict=True))
-
-    def given(row: Sequence[NDArray[np.float32]]) -> tuple[Any, ...]:
-        tensors = (torch.tensor(values).reshape(1, len(values), 1, -1) for values in row)
-        return tuple(tensor.contiguous(memory_format=order_of(case)) for tensor in tensors)
-
-    quantizer = XNNPACKQuantizer().set_global(get_symmetric_quantization_config(is_per_channel=True))
-    prepared = prepare_pt2e(torch.export.export(module, given(rows[0])).module(), quantizer)
-    for row in rows:
-        prepared(*given(row))
-    whole = torch.export.export(convert_pt2e(prepared), given(rows[0]))
-    lowered = to_edge_transform_and_lower(whole, partitioner=[XnnpackPartitioner()])
-    left = [str(n.target) for n in lowered.exported_program().graph.nodes if n.op == "call_function"]
-    path.write_bytes(lowered.to_executorch().buffer)
-    return {"outside_xnnpack": [n for n in left if "executorch_call_delegate" not in n and "getitem" not in n]}
-
-
-def order_of(case: Case) -> Any:
-    """Return the memory format of the inputs: XNNPACK's quantized `cat` fails with channels last (executorch 1.5.1)."""
-    import torch
-
-    return torch.contiguous_format if states_of(case) else torch.channels_last
-
-
-def run_executorch(case: Case, path: Path) -> Model:
-    import torch
-    from executorch.runtime import Runtime
-
-    torch.set_num_threads(1)
-    method = Runtime.get().load_program(path).load_method("forward")
-    shapes = [case["x"].shape[1:], *states_of(case).values()]
-    inputs = [torch.zeros(1, c, 1, n).contiguous(memory_format=order_of(case)) for c, n in shapes]
-    out: list[Any] = []
-
-    def carry() -> None:
-        for state, values in zip(inputs[1:], out[1:], strict=True):
-            state.copy_(values)
-
-    def decide() -> None:
-        out[:] = method.execute(inputs)
-
-    return Model(
-        lambda samples: inputs[0].copy_(torch.tensor(samples[None, :, None])), decide,
-        lambda: np.asarray(out[0][0].numpy(), dtype=np.float64), carry,
-    )  # fmt: skip
-
-
 # ---- All runtimes -----------------------------------------------------------------------------------------------
 
 Make = Callable[[Case, Path], Facts]
@@ -367,15 +272,11 @@ Run = Callable[[Case, Path], Model]
 PEERS: dict[str, tuple[Make, Run | None]] = {
     "tflite-micro": (make_tflite_micro, run_tflite_micro),
     "litert": (make_tflite, run_litert),
-    "executorch": (make_executorch, run_executorch),
     "onnxruntime": (make_onnx, run_onnx),
     "onnxruntime-int8": (make_onnx_int8, run_onnx),
     "cmsis-nn": (make_cmsis_nn, None),
 }
-PACKAGES = (
-    "tflite-micro", "ai-edge-litert", "ai-edge-quantizer", "executorch", "torch", "torchao", "onnxruntime", "onnx",
-    "numpy",
-)  # fmt: skip
+PACKAGES = ("tflite-micro", "ai-edge-litert", "ai-edge-quantizer", "onnxruntime", "onnx", "numpy")
 
 
 def make(case: Case, peer: str, path: Path) -> Facts:

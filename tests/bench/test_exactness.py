@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -32,10 +33,11 @@ def test_ours_is_compared_on_the_windows_of_the_people_who_were_held_out(
     of_one = training_windows(replace(bundle, provenance={**origin, "subjects": ["P4"]}), dataset)
     monkeypatch.setattr(sys, "argv", ["exactness.py", str(path), str(dataset.path), "--only", "none"])
     assert exactness.main() == 0
-    first, _, row = capsys.readouterr().out.splitlines()
-    assert first.endswith("windows of P4, who were not trained on")
-    assert int(first.split(": ")[1].split()[0]) > len(of_one), "closer together than those of the training"
-    assert row.startswith("PlushSense, int8") and float(row.split()[-4]) > 90 and 0 < float(row.split()[-2]) < 10
+    found = json.loads(capsys.readouterr().out)
+    assert found["people"] == ["P4"]
+    assert found["windows"] > len(of_one), "closer together than those of the training"
+    row = found["rows"]["PlushSense, int8"]
+    assert row["agreement"] > 0.9 and 0 < row["logit_error"] < 0.1
 
     replace(bundle, provenance={**origin, "validation_subjects": []}).save(tmp_path / "none.plush")
     monkeypatch.setattr(sys, "argv", ["exactness.py", str(tmp_path / "none.plush"), str(dataset.path)])

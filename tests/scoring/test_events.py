@@ -229,6 +229,13 @@ def test_order_does_not_matter(
     assert all_of(*shuffled) == before
 
 
+def test_the_first_of_overlapping_truths_is_taken_first_in_whatever_order_they_are_given() -> None:
+    truths = [Interval(0.0, 0.5, HUG), Interval(0.0, 1.5, HUG)]
+    events = [Interval(0.2, 0.3, HUG), Interval(1.0, 1.1, HUG)]
+    for given_truths in (truths, truths[::-1]):
+        assert cost(given_truths, events, ["positive"] * 2, FAMILIES, AFFECTS, late_s=0.0) == 0.0
+
+
 @given(st.lists(st.tuples(st.integers(1, 6), LABELS), max_size=8))
 def test_a_perfect_answer_has_no_error(pieces: list[tuple[int, str]]) -> None:
     truths, now = [], 0.0

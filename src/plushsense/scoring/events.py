@@ -288,6 +288,8 @@ def cost(
         families, affect_of: family and affect of each gesture; the affect "none" means unknown.
     """
     weights = weights or ErrorCosts()
+    # Of several truths of an event's gesture, the earliest is taken first, in whatever order they are given.
+    truths = sorted(truths, key=lambda t: (t.start_s, t.stop_s))
     over = np.vstack([overlaps(truths, events, late_s), overlaps(practice, events, late_s)])
     total = float(weights.missed * (len(truths) - int(over[: len(truths)].any(axis=1).sum() if len(events) else 0)))
     labelled = [*truths, *practice]
