@@ -23,8 +23,8 @@ from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live import reader as live
 from plushsense.studio.pages.live.feed import STRIP_S, WINDOW_S, Feed
+from plushsense.studio.pages.live.live_state import EventSpan, LiveChoice, LiveState, Situation, quiet_reason
 from plushsense.studio.pages.live.reader import LiveReader
-from plushsense.studio.pages.live.state import EventSpan, LiveChoice, LiveState, Situation, quiet_reason
 from support.bundles import OTHER, odd_bundle
 from support.waiting import until
 

@@ -24,7 +24,7 @@ from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review.controller import VIEWS
 from plushsense.studio.pages.train.result_details import confusion_table
-from plushsense.studio.pages.train.results import Confusion
+from plushsense.studio.pages.train.stored_results import Confusion
 from plushsense.studio.widgets.elements import link, picture, verdict
 from plushsense.workflow.api import simulate
 from plushsense.workflow.reporting import SCORES
@@ -250,7 +250,7 @@ def test_no_value_is_put_into_html_unescaped() -> None:
         if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("Markup")
         if not isinstance(node.args[0], ast.Constant)
     }
-    assert {name.partition(":")[0] for name in made} == {"elements.py", "page.py", "results_section.py"}
+    assert {name.partition(":")[0] for name in made} == {"elements.py", "home_page.py", "results_section.py"}
     assert len(made) == 5
 
 

@@ -17,9 +17,9 @@ from plushsense.recording.session import next_session
 from plushsense.recording.session_files import SessionHead, read_events
 from plushsense.recording.writer import StreamFile
 from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
-from plushsense.studio.pages.live.state import LiveChoice
 from support.bundles import odd_bundle
 from support.waiting import until
 

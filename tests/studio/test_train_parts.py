@@ -20,9 +20,10 @@ from plushsense.models.bundle import Bundle
 from plushsense.studio.app.jobs import Jobs, StudioJob
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.train.jobs import progress_charts
-from plushsense.studio.pages.train.requests import JobRequest, free_name, grids, job_request
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.job_cards import progress_charts
+from plushsense.studio.pages.train.job_requests import JobRequest, free_name, grids, job_request
+from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_rows, pareto_table
+from plushsense.studio.pages.train.stored_results import (
     TRAINING,
     Confusion,
     ResultRow,
@@ -31,7 +32,6 @@ from plushsense.studio.pages.train.results import (
     recordings_of_cell,
     sum_by_affect,
 )
-from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_rows, pareto_table
 from plushsense.studio.tasks import Clock
 from plushsense.workflow.config import from_settings
 

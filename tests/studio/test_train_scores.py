@@ -18,7 +18,7 @@ from plushsense.scoring.metrics import accuracy_over_people
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.train.result_details import confusion_table, worst_table
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.stored_results import (
     EVALUATION,
     TRAINING,
     TRIAL,

@@ -58,7 +58,7 @@ DESK, TABLET, PHONE = (1280, 800), (820, 1180), (390, 844)
 # Importing takes longer than starting: a server process imports once, and every studio is forked from it.
 _FORKING = multiprocessing.get_context("forkserver")
 _FORKING.set_forkserver_preload(
-    ["nicegui", "plushsense.studio.app.serve", *(f"plushsense.studio.pages.{name}.page" for name in PAGES)]
+    ["nicegui", "plushsense.studio.app.serve", *(f"plushsense.studio.pages.{name}.{name}_page" for name in PAGES)]
 )
 
 

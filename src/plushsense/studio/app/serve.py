@@ -227,7 +227,7 @@ def _page(workspace: Workspace, name: str) -> Callable[[], Any]:
 
         from plushsense.studio.app.shell import frame
 
-        module = importlib.import_module(f"plushsense.studio.pages.{name}.page")
+        module = importlib.import_module(f"plushsense.studio.pages.{name}.{name}_page")
         task = asyncio.current_task()
         assert task is not None
         # Stop building a page that was left meanwhile: the elements to which it would add others are deleted.

@@ -100,8 +100,8 @@ PAGES = {
 }
 """The pages: maps name to path, in the order of the navigation bar.
 
-To add a page, add a line here and a folder ``pages/<name>`` with a module ``page``, whose function ``show(page)`` adds
-the content below the title. The folder's ``__init__`` holds its `PageTexts` as ``TEXTS``.
+To add a page, add a line here and a folder ``pages/<name>`` with a module ``<name>_page``, whose function
+``show(page)`` adds the content below the title. The folder's ``__init__`` holds its `PageTexts` as ``TEXTS``.
 """
 
 TOUR = "tour"

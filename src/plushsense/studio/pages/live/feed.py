@@ -18,8 +18,8 @@ from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.guard import is_loopback
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, on_change
 from plushsense.studio.app.words import Texts, Words
+from plushsense.studio.pages.live.live_state import UNREAD, EventSpan, LiveState, Situation
 from plushsense.studio.pages.live.reader import LiveReader
-from plushsense.studio.pages.live.state import UNREAD, EventSpan, LiveState, Situation
 
 VIEW_TEXTS: Texts = {
     "signals": "Signals",

@@ -25,7 +25,7 @@ from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-from plushsense.studio.pages.live.state import Connection, EventSpan, LiveChoice, LiveState, quiet_reason
+from plushsense.studio.pages.live.live_state import Connection, EventSpan, LiveChoice, LiveState, quiet_reason
 
 KEPT_SPANS = 200
 KEPT_SPAN_S = 600.0

@@ -23,7 +23,7 @@ from plushsense.studio.app.shell import (
     tag,
 )
 from plushsense.studio.app.words import Words
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.stored_results import (
     EVALUATION,
     HELD_BACK,
     LINKS,

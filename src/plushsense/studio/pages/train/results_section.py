@@ -17,7 +17,7 @@ from plushsense.scoring.metrics import pareto_front
 from plushsense.studio.app.shell import Page, heading, html, named, scroll_region, section, tag
 from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.pages.train.result_details import ResultDetailsView
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.stored_results import (
     EVALUATION,
     TRAINING,
     TRIAL,

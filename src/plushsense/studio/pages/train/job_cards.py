@@ -11,8 +11,8 @@ from nicegui import ui
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, section, tag
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.job_requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
+from plushsense.studio.pages.train.stored_results import (
     LINKS,
     ResultRow,
     StoredResults,

@@ -19,11 +19,11 @@ from plushsense.studio.app.toys import Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL
 from plushsense.studio.pages.live import adapting, validation_page
+from plushsense.studio.pages.live.event_log import LogButtons
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
-from plushsense.studio.pages.live.log import LogButtons
+from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
-from plushsense.studio.pages.live.state import LiveChoice
 from plushsense.studio.widgets.elements import notice, style, summary
 
 _REACTIONS: Texts = {

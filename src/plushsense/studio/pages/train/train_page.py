@@ -15,8 +15,8 @@ from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, add_style, button, focus, html, on_change, query_path, section, tag
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.jobs import JobsSection, warning_texts
-from plushsense.studio.pages.train.requests import (
+from plushsense.studio.pages.train.job_cards import JobsSection, warning_texts
+from plushsense.studio.pages.train.job_requests import (
     BUILT_IN,
     EVALUATE,
     KINDS,
@@ -31,8 +31,14 @@ from plushsense.studio.pages.train.requests import (
     grids,
     job_request,
 )
-from plushsense.studio.pages.train.results import StoredResults, counted, duration_text, leaky_warning, score_labels
 from plushsense.studio.pages.train.results_section import ResultsSection
+from plushsense.studio.pages.train.stored_results import (
+    StoredResults,
+    counted,
+    duration_text,
+    leaky_warning,
+    score_labels,
+)
 from plushsense.studio.pages.train.verdict import FEW_PEOPLE
 from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, scroll_to
 from plushsense.training.spec import DEVICES, PRESETS

@@ -20,8 +20,8 @@ from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.record.child import CHILD, ConnectionAlert, gesture_picture, style
 from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
+from plushsense.studio.pages.record.last_recording import ResultPanel
 from plushsense.studio.pages.record.panels import SignalPanel, StepList
-from plushsense.studio.pages.record.result import ResultPanel
 
 _STATES: Texts = {
     "countdown": "GET READY",

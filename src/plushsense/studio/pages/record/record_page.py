@@ -20,7 +20,7 @@ from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import CHILD, show_child
 from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
-from plushsense.studio.pages.record.session import collect, show_session
+from plushsense.studio.pages.record.session_page import collect, show_session
 from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
 
 _WORDINGS: Texts = {

@@ -13,8 +13,8 @@ from plushsense.studio.app.shell import AFFECT_SIGNS, Page, add_style, button, h
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import plain_name
 from plushsense.studio.pages.live.feed import VIEW_TEXTS
+from plushsense.studio.pages.live.live_state import EventSpan
 from plushsense.studio.pages.live.reader import LiveReader
-from plushsense.studio.pages.live.state import EventSpan
 from plushsense.studio.widgets.elements import table_html
 
 _PRINT = """
