@@ -357,7 +357,6 @@ def test_the_virtual_person_does_what_is_asked(workspace: Workspace) -> None:
     assert reader.now.next_gesture == "Tail pull"
     until(lambda: reader.performed()[-1].label == "Tail pull" and reader.now.next_gesture == "")
     made = reader.performed()
-    assert [p.number for p in made] == list(range(1, len(made) + 1))
     until(lambda: reader.now.t_s > made[-1].end_s + 10.0)
     assert reader.performed() == made, "and then nothing more"
     reader.direct(None)
