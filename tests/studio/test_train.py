@@ -408,8 +408,8 @@ def test_what_is_wrong_is_named_beside_its_field(studio: Fixture, look: Fixture,
     kind(page, "Pārbaudīt ar svešiem cilvēkiem")
     marked(page, "start").click()
     refused = state(page, "refused").locator('[data-test="refused"]')
-    assert refused.inner_text() == f"Rezultātu nevar ierakstīt: “{folder / 'evaluations'}” ir fails, nevis mape. " + (
-        "Pārvietojiet vai pārdēvējiet to."
+    assert refused.inner_text() == (
+        "Rezultātu nevar ierakstīt: “evaluations” ir fails, nevis mape. Pārvietojiet vai pārdēvējiet to."
     )
     shutil.move(folder, home / "elsewhere")
     marked(page, "make").click()
