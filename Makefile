@@ -101,7 +101,7 @@ STUDIO_HOURS ?= 1
 DRILLS ?= 30
 soak: $(VENV)/.dev
 	PLUSHSENSE_SOAK=1 PLUSHSENSE_DRILLS=$(DRILLS) $(BIN)/python -m pytest $(UNLIMITED) tests/faults tests/studio/test_live_long.py \
-	  tests/studio/test_record_whole.py tests/recording/test_whole_session.py
+	  tests/recording/test_whole_session.py
 	$(BIN)/python bench/soak.py --hours $(SOAK_HOURS) --studio-hours $(STUDIO_HOURS)
 
 BASE := core devices recording dataset windows models runtime live tuning scoring

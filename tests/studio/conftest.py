@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import os
 import shutil
 import socket
 import threading
@@ -22,7 +21,7 @@ from support.sharing import built_once
 from support.trainings import train_apart
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, BrowserContext, Page
+    from playwright.sync_api import Browser, BrowserContext
 
 
 @pytest.fixture
@@ -134,22 +133,6 @@ def look(chromium: Browser, profiles: dict[tuple[str, bool], list[BrowserContext
             profiles[shared].append(one.context)
         foreign = [u for u in one.asked if not is_own(u)]
         assert foreign == [], f"the page asked for something foreign: {foreign}"
-
-
-@pytest.fixture
-def shots() -> Callable[[Page, str], None]:
-    """Takes a screenshot of the whole page into ``PLUSHSENSE_SHOTS``, for looking at; nothing where that is not set."""
-    folder = os.environ.get("PLUSHSENSE_SHOTS")
-
-    def take(page: Page, name: str) -> None:
-        if not folder:
-            return
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(Exception):
-            page.wait_for_load_state("networkidle", timeout=2000)
-        page.screenshot(path=str(Path(folder) / f"{name}.png"), full_page=True)
-
-    return take
 
 
 @pytest.fixture(scope="session")

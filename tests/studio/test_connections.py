@@ -18,15 +18,9 @@ from urllib.parse import urlsplit
 import pytest
 
 from plushsense.core.recorder_csv import STREAM_NAME
-from plushsense.studio.app import guard
-from plushsense.studio.app.guard import (
-    ConnectionLimits,
-    Guard,
-    Visitors,
-    drop_slow_clients,
-    limited_protocol,
-    peer_of,
-)
+from plushsense.studio.app import connections
+from plushsense.studio.app.connections import ConnectionLimits, drop_slow_clients, limited_protocol, peer_of
+from plushsense.studio.app.guard import Guard, Visitors
 from support.browsing import connected
 from support.recording_pages import CALM, begun, files, showing, take
 from support.waiting import until
@@ -238,7 +232,7 @@ def test_a_new_connection_takes_the_place_of_the_one_that_waits_longest() -> Non
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has all addresses of 127.0.0.0/8")
 def test_peers_share_what_this_machine_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guard, "peer_of", lambda client, _server: "" if client == "127.0.0.1" else client)
+    monkeypatch.setattr(connections, "peer_of", lambda client, _server: "" if client == "127.0.0.1" else client)
     wait = b"GET /wait HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     limits = ConnectionLimits(total=8, per_peer=3, head_s=600)
     with serving(limits, length) as port, contextlib.ExitStack() as stack:
@@ -254,7 +248,7 @@ def test_peers_share_what_this_machine_leaves(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has all addresses of 127.0.0.0/8")
 def test_two_hundred_clients_are_all_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each address asks and keeps its connection: no more than the limit stay open, and this computer is answered."""
-    monkeypatch.setattr(guard, "peer_of", lambda client, _server: "" if client == "127.0.0.1" else client)
+    monkeypatch.setattr(connections, "peer_of", lambda client, _server: "" if client == "127.0.0.1" else client)
     limits = ConnectionLimits(total=40, per_peer=8, head_s=600, keep_alive_s=600)
     with serving(limits, length) as port, contextlib.ExitStack() as stack:
         clients = []

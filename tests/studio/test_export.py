@@ -15,8 +15,7 @@ import pytest
 
 import plushsense as ps
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.studio import tasks
-from plushsense.studio.app.guard import path_in, zip_chunks
+from plushsense.studio.app.guard import path_in, zip_of
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.workspace import EXPORTS, Workspace, folder_digest
 from plushsense.studio.pages.export.exports import (
@@ -27,7 +26,7 @@ from plushsense.studio.pages.export.exports import (
     newest_job,
     targets,
 )
-from plushsense.studio.tasks import TaskReporter
+from plushsense.studio.tasks import TASKS, TaskReporter
 from support.exported import bundle_of, flip, sums
 
 
@@ -50,7 +49,7 @@ def test_the_task_writes_what_the_library_writes(
     # Without compilers and emulators the export stands, and says what would count.
     monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
     place, bundle = little.new(EXPORTS, "one"), str(little.bundles()[0])
-    result, reports = run_task(tasks.run_export, bundle=bundle, place=str(place), also=[], dataset="")
+    result, reports = run_task(TASKS["export"], bundle=bundle, place=str(place), also=[], dataset="")
     ps.export(bundle, tmp_path / "two")
     assert sums(place) == sums(tmp_path / "two")
     assert set(result["files"]) == set(sums(place))
@@ -64,7 +63,7 @@ def test_the_task_writes_what_the_library_writes(
     assert "qemu-system-arm" in result["profile"]["refused"]
     assert "gcc" in targets()["host"] and "gcc-xtensa-lx106" in targets()["xtensa"]
     with pytest.raises(BadInput, match="already holds something"):
-        run_task(tasks.run_export, bundle=bundle, place=str(place), also=[], dataset="")
+        run_task(TASKS["export"], bundle=bundle, place=str(place), also=[], dataset="")
 
 
 def test_a_flipped_byte_is_another_export(little: Workspace, tmp_path: Path) -> None:
@@ -80,8 +79,8 @@ def test_a_broken_export_is_found(little: Workspace, target_here: Callable[[str]
     flip(tmp_path / "one" / "plush_model.c")
     spec = {"place": str(tmp_path / "one"), "targets": [target_here("cortex-m4")]}
     with pytest.raises(BadInput, match=r"plush_model\.c in .* is not what this PlushSense writes"):
-        run_task(tasks.run_verify, **spec)
-    result, reports = run_task(tasks.run_verify, **spec, trust=True)
+        run_task(TASKS["verify"], **spec)
+    result, reports = run_task(TASKS["verify"], **spec, trust=True)
     assert not result["own"] and not result["passed"] and result["mismatches"] > 0 and result["first"]
     assert result["changed"] == ["plush_model.c"]
     assert reports[-1]["progress"]["done"] == reports[-1]["progress"]["total"]
@@ -106,8 +105,8 @@ def test_facts_of_bundles(tmp_path: Path) -> None:
 def test_a_zip_on_the_way(little: Workspace) -> None:
     place = little.new(EXPORTS, "ā one")
     ps.export(little.bundles()[0], place)
-    packed = b"".join(zip_chunks(place))
-    assert packed == b"".join(zip_chunks(place))
+    packed = zip_of(place)
+    assert packed == zip_of(place)
     with zipfile.ZipFile(io.BytesIO(packed)) as archive:
         assert archive.testzip() is None
         got = {n.removeprefix("ā one/"): hashlib.sha256(archive.read(n)).hexdigest() for n in archive.namelist()}
@@ -120,7 +119,7 @@ def test_a_link_takes_nothing_along(little: Workspace, tmp_path: Path) -> None:
     ps.export(little.bundles()[0], place)
     (tmp_path / "secret").write_text("secret")
     (place / "golden" / "secret").symlink_to(tmp_path / "secret")
-    with zipfile.ZipFile(io.BytesIO(b"".join(zip_chunks(place)))) as archive:
+    with zipfile.ZipFile(io.BytesIO(zip_of(place))) as archive:
         assert "one/golden/secret" not in archive.namelist()
     (little.folder / EXPORTS / "away").symlink_to(tmp_path)
     for name in ("away", "..", ".", "../bundles"):

@@ -15,10 +15,10 @@ from plushsense.core.errors import PlushSenseError
 from plushsense.models.arch import Arch
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.train import results
+from plushsense.studio.pages.train import stored_results
 from plushsense.studio.pages.train.result_details import confusion_table, worst_table
-from plushsense.studio.pages.train.results import EVALUATION, TRIAL, ResultRow, StoredResults, split_text
 from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_table
+from plushsense.studio.pages.train.stored_results import EVALUATION, TRIAL, ResultRow, StoredResults, split_text
 from plushsense.studio.pages.train.verdict import figures, headline, limits, people_table
 from plushsense.workflow.reporting import LEARNING, SCORES
 from support.study import evaluation
@@ -207,5 +207,5 @@ def test_nothing_outside_is_read(home: Path, tmp_path: Path, monkeypatch: pytest
         (home / "datasets" / "DS" / "evaluations" / "folder").symlink_to(elsewhere)
         (folder_of(home, "curved") / SCORES).write_text(json.dumps(SCORED), encoding="utf-8")
     assert {Path(found.path).name for found in StoredResults(Workspace(home)).rows()} <= {"one", "curved"}
-    monkeypatch.setattr(results, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(stored_results, "_MOST_BYTES", 1000)
     assert StoredResults(Workspace(home)).rows() == [row]

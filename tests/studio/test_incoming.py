@@ -19,7 +19,7 @@ from plushsense.dataset.importing.sources import LAYOUT_GUESSED
 from plushsense.dataset.index import open_dataset
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import DATASETS
-from plushsense.studio.tasks import TaskReporter, run_inspect
+from plushsense.studio.tasks import TASKS, TaskReporter
 from support.accelerometers import analogue
 from support.browsing import LONG_MS, TABLET, axe, marked
 
@@ -49,7 +49,7 @@ def zipped(folder: Path, target: Path) -> Path:
 
 def inspect(dest: Path, *sources: Path, layout: str = "", person: str = "") -> dict[str, Any]:
     spec = {"sources": [str(s) for s in sources], "dest": str(dest), "layout": layout, "person": person}
-    return run_inspect(spec, TaskReporter(io.StringIO()))
+    return TASKS["inspect"](spec, TaskReporter(io.StringIO()))
 
 
 def drop(page: Any, *paths: Path) -> None:

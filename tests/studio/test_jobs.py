@@ -117,16 +117,6 @@ def test_stopped_work_ends_soon_and_can_be_begun_again(workspace: Workspace, job
     assert jobs.all() == [] and not (workspace.folder / WORK / f"{job.id}.json").exists()
 
 
-def test_closing_stops_everything(workspace: Workspace) -> None:
-    jobs = Jobs(workspace)
-    two = [jobs.start("simulate", spec(workspace, f"long {n}", LONG), "Long") for n in range(2)]
-    for job in two:
-        until(lambda job=job: job.progress)
-    jobs.close()
-    for job in two:
-        assert ended(job).state == STOPPED
-
-
 def test_ids_are_unique_in_order_also_when_the_clock_goes_back(
     workspace: Workspace, jobs: Jobs, monkeypatch: pytest.MonkeyPatch
 ) -> None:

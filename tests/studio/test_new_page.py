@@ -50,7 +50,7 @@ def test_a_page_is_one_folder_and_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "pages" / "hello"
     folder.mkdir(parents=True)
     (folder / "__init__.py").write_text(TEXTS)
-    (folder / "page.py").write_text(PAGE)
+    (folder / f"{folder.name}_page.py").write_text(PAGE)
     env = {k: v for k, v in os.environ.items() if not k.startswith(("NICEGUI_", "PYTEST_"))}
     command = [sys.executable, "-c", STUDIO, str(folder.parent), str(tmp_path / "home")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) as studio:

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.studio import tasks
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace
 from plushsense.studio.pages.home.overview import (
     BundleEntry,
@@ -19,7 +18,7 @@ from plushsense.studio.pages.home.overview import (
     WorkspaceSummary,
     next_step,
 )
-from plushsense.studio.tasks import TaskReporter
+from plushsense.studio.tasks import TASKS, TaskReporter
 from plushsense.workflow.api import simulate
 from support.recorded import record
 
@@ -44,7 +43,7 @@ def take_in(workspace: Workspace, sessions: list[Path], name: str, **more: Any) 
         "name": name,
         **more,
     }
-    return tasks.run_import(spec, REPORTER)
+    return TASKS["import"](spec, REPORTER)
 
 
 def test_sessions_wait_until_a_data_set_holds_all_of_them(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import itertools
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -68,14 +67,3 @@ def test_a_users_own(tmp_path: Path) -> None:
     assert own_picture(tmp_path, "Tail pull") == "data:image/svg+xml;base64,PHN2Zy8+"
     for label in ("Hold strong", "At rest", "Hold in hands", "../secret"):
         assert own_picture(tmp_path, label) == ""
-
-
-def test_they_are_looked_at(chromium: Any, shots: Callable[..., None]) -> None:
-    page = chromium.new_page(viewport={"width": 1500, "height": 900})
-    for ground in ("#ffffff", "#121212"):
-        each = "".join(f"<div>{picture(label)}</div>" for label in LABELS)
-        style = "display: grid; grid-template-columns: repeat(6, 1fr); gap: 8px"
-        page.set_content(f'<body style="background: {ground}"><div style="{style}">{each}</div></body>')
-        assert page.locator("svg").count() == 18
-        shots(page, f"pictures-{ground[1:]}")
-    page.close()

@@ -13,7 +13,6 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.publishing.checking import VALIDATORS
-from plushsense.studio import tasks
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.words import LANGUAGES, Words
 from plushsense.studio.app.workspace import PACKAGES, Workspace
@@ -26,7 +25,7 @@ from plushsense.studio.pages.publish.packages import (
     packages_of,
     reidentification_text,
 )
-from plushsense.studio.tasks import TaskReporter
+from plushsense.studio.tasks import TASKS, TaskReporter
 
 SAID = {"licence": "CC-BY-4.0", "contact": "Ada <ada@example.org>", "consent": "all agreed"}
 
@@ -58,7 +57,7 @@ def test_a_package_by_the_tasks(few: Path, publish_tools: None, monkeypatch: pyt
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", refuse)
-    result, reports = run_task(tasks.run_publish, **spec, **SAID, save=True)
+    result, reports = run_task(TASKS["publish"], **spec, **SAID, save=True)
     assert any("could not be written into" in said for said in result["warnings"])
     assert result["valid"] and [v["validator"] for v in result["validators"]] == list(VALIDATORS)
     stages = {r["progress"]["stage"] for r in reports}
@@ -69,12 +68,12 @@ def test_a_package_by_the_tasks(few: Path, publish_tools: None, monkeypatch: pyt
     assert found.contents["data/recordings/"][0] == 9
     assert sum(files for files, _ in found.contents.values()) == result["files"]
     with pytest.raises(DatasetError, match="already holds something"):
-        run_task(tasks.run_publish, **spec, **SAID)
+        run_task(TASKS["publish"], **spec, **SAID)
     with pytest.raises(DatasetError, match="lies in"):
-        run_task(tasks.run_publish, **{**spec, "place": f"{place}2", "key": str(workspace.datasets()[0] / "k")}, **SAID)
+        run_task(TASKS["publish"], **{**spec, "place": f"{place}2", "key": str(workspace.datasets()[0] / "k")}, **SAID)
     # The zip alone says the same; a damaged folder is found out.
     (place / "gestures.csv").write_text("Shake\n", "utf-8")
-    assert not run_task(tasks.run_validate, place=str(place))[0]["valid"]
+    assert not run_task(TASKS["validate"], place=str(place))[0]["valid"]
     shutil.rmtree(place)
     alone = PackageFacts.of(workspace, "one")
     assert (alone.folder, alone.citation, alone.contents) == (None, found.citation, found.contents)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("publish_tools")
 
 
 @pytest.mark.exhaustive
-def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture, few: Path, tmp_path: Path) -> None:
+def test_publish_check_and_break(studio: Fixture, look: Fixture, few: Path, tmp_path: Path) -> None:
     url = studio(home=few).url
     browser = look()
     page = browser.open(f"{url}/publish")
@@ -66,7 +66,6 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     about = DatasetHead.read(few / "datasets" / "virtual").about
     assert about.creators == (Creator("Byron, Ada", "0000-0002-1825-0097"),) and about.title == "Touch"
     assert axe(page) == []
-    shots(page, "publish-done")
     key, made = few / "keys" / "virtual.key", few / "packages" / "one.zip"
     command = [sys.executable, "-m", "plushsense", "publish", str(few / "datasets" / "virtual")]
     marked(page, "creator-add").click()
@@ -96,12 +95,11 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     assert "gestures.csv" in marked(tablet, "problems").inner_text()
     assert axe(tablet) == []
     assert tablet.evaluate("() => document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
-    shots(tablet, "publish-lv-dark-tablet")
     assert browser.complaints == [] and other.complaints == []
 
 
 @pytest.mark.exhaustive
-def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fixture, few: Path) -> None:
+def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, few: Path) -> None:
     head = few / "datasets" / "virtual" / "dataset.toml"
     silent = head.read_text("utf-8").replace('consent = "nobody: a simulation"', 'consent = ""')
     head.write_text(silent.replace('licence = "MIT"', 'licence = ""'), "utf-8")
@@ -116,7 +114,6 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     assert marked(page, "with-key").get_attribute("aria-checked") == "true"
     marked(page, "key").fill("../people.csv")
     assert axe(page) == []
-    shots(page, "publish-pseudonyms")
     marked(page, "licence").click()
     page.get_by_role("option", name="CC-BY-4.0: ").click()
     for name in ("data-title", "description", "creator-name", "contact-name", "consent"):
@@ -150,10 +147,4 @@ def test_missing_extras_are_named(studio: Fixture, look: Fixture, few: Path) -> 
     assert "pip install 'plushsense[publish]'" in marked(page, "missing-publish").inner_text()
     assert "pip install 'plushsense[baselines]'" in marked(page, "missing-baselines").inner_text()
     assert marked(page, "do").is_disabled()
-    assert axe(page) == []
-
-
-def test_without_a_data_set(studio: Fixture, look: Fixture) -> None:
-    page = look(dark=True).open(f"{studio().url}/publish")
-    assert "There is no data set yet" in marked(page, "no-dataset").inner_text()
     assert axe(page) == []

@@ -23,8 +23,8 @@ from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live import reader as live
 from plushsense.studio.pages.live.feed import STRIP_S, WINDOW_S, Feed
+from plushsense.studio.pages.live.live_state import EventSpan, LiveChoice, LiveState, Situation, quiet_reason
 from plushsense.studio.pages.live.reader import LiveReader
-from plushsense.studio.pages.live.state import EventSpan, LiveChoice, LiveState, Situation, quiet_reason
 from support.bundles import OTHER, odd_bundle
 from support.waiting import until
 
@@ -88,16 +88,6 @@ def test_what_does_not_fit_is_refused_and_what_ran_goes_on(
     until(lambda: reader.now.t_s > at + 1.0)
     assert (reader.choice, reader.now.generation) == (before, generation)
     assert reader.now.running
-
-
-def test_a_bundle_of_another_layout_says_both(workspace: Workspace) -> None:
-    reader = workspace.part(LiveReader)
-    # The same labels, so that only the channels differ.
-    reader.start(LiveChoice(VIRTUAL, bundle(workspace)))
-    with pytest.raises(ConfigError, match=r"'plush-15'.*'accel-3'"):
-        reader.choose(bundle(workspace, "accel"), "float", "")
-    with pytest.raises(PlushSenseError, match="plush-15"):
-        reader.start(LiveChoice(f"{VIRTUAL}&layout=plush-15", bundle(workspace, "accel")))
 
 
 def test_it_starts_with_sentences_or_not_at_all(workspace: Workspace) -> None:
@@ -367,7 +357,6 @@ def test_the_virtual_person_does_what_is_asked(workspace: Workspace) -> None:
     assert reader.now.next_gesture == "Tail pull"
     until(lambda: reader.performed()[-1].label == "Tail pull" and reader.now.next_gesture == "")
     made = reader.performed()
-    assert [p.number for p in made] == list(range(1, len(made) + 1))
     until(lambda: reader.now.t_s > made[-1].end_s + 10.0)
     assert reader.performed() == made, "and then nothing more"
     reader.direct(None)

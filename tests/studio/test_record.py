@@ -11,7 +11,7 @@ import pytest
 
 from plushsense.recording.session import is_finished
 from plushsense.recording.writer import SessionHead
-from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
+from support.browsing import PHONE, TABLET, axe, connected, marked
 from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, stop, take, whats
 from support.waiting import until
 
@@ -442,7 +442,7 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="Windows cannot stop a process for a while")
 @pytest.mark.exhaustive
-def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: Fixture, shots: Fixture) -> None:
+def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: Fixture) -> None:
     server, browser = studio("--device", CALM), look()
     page = begun(browser.open(server.url + "/record"), server.url, "S01")
     take(page, 0, 0.8)
@@ -464,7 +464,6 @@ def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: 
     for name in ("state-box", "number", "main", "signal"):
         assert not marked(page, name).is_visible()
     assert axe(page) == []
-    shots(page, "record_lost")
     server.start()
     # Another process knows nothing of this page, which is loaded again: what was broken off is to be taken up.
     page.get_by_text("Unfinished sessions").wait_for()
@@ -477,66 +476,49 @@ def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: 
 
 
 @pytest.mark.exhaustive
-def test_it_speaks_latvian_and_fits_a_phone(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
-    server = studio("--device", CALM, "--speed", "3")
-    for number, (language, dark, size) in enumerate((("lv", True, PHONE), ("en", False, DESK))):
-        browser, code = look(size, dark, language, touch=size == PHONE), f"S0{number + 1}"
-        page = browser.open(server.url + "/record?new=1")
-        where = f"record-{language}-{'dark' if dark else 'light'}-{size[0]}"
-        assert axe(page) == []
-        shots(page, f"{where}-new")
-        page.locator('[data-test="code"]').fill("Anna B")
-        marked(page, "begin").click()
-        page.get_by_role("alert").filter(
-            has_text="nav dalībnieka kods" if language == "lv" else "is no code for a person"
-        ).wait_for()
-        assert axe(page) == []
-        if language == "lv":
-            own_list(page)
-        marked(page, "code").fill(code)
-        choose(page, "protocol", "Izmēģināšanai" if language == "lv" else "Short trial")
-        marked(page, "begin").click()
-        sat(page, f"{code}/1")
-        said = "Glaudi rotaļlietai muguru; rotaļlieta stāv uz galda"
-        assert marked(page, "prompt").inner_text() == (
-            said if language == "lv" else "Stroke the toy's back; the toy stands on a table"
-        )
-        if language == "lv":
-            assert marked(page, "gesture").inner_text() == "Muguras glāstīšana 1"
-        assert marked(page, "simulation").is_visible()
-        assert marked(page, "picture").locator("svg").get_attribute("aria-label")
-        page.wait_for_function("() => document.querySelectorAll('[data-test^=plot-] canvas').length === 3")
-        for name in ("gesture", "prompt", "state-box", "main"):
-            box = marked(page, name).bounding_box()
-            assert box is not None and box["y"] + box["height"] <= size[1], f"{name} is visible without scrolling"
-        for state in ("idle", "countdown", "recording"):
-            if state == "countdown":
-                marked(page, "main").click()
-            # A busy machine may miss the countdown.
-            seen = showing(page, f"{state}.0.", "recording.0.")
-            if state != "countdown":
-                assert axe(page) == [], state
-            shots(page, f"{where}-{seen.partition('.')[0]}")
-        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
-        marked(page, "main").click()
-        showing(page, "idle.1.")
-        for expected in ("idle.2.", "idle.3.", "finished."):
-            page.keyboard.press("s")
-            showing(page, expected)
-        assert axe(page) == []
-        shots(page, f"{where}-finished")
-        marked(page, "redo").click()
-        showing(page, "idle.0.")
-        page.keyboard.press("p")
-        showing(page, "paused.0.")
-        marked(page, "end").click()
-        marked(page, "end-yes").wait_for()
-        assert axe(page) == []
-        shots(page, f"{where}-paused")
-        marked(page, "end-yes").click()
-        page.wait_for_url(f"**/record?ended={code}/1")
-        connected(page)
-        assert marked(page, f"unfinished-{code}/1").is_visible()
-        assert axe(page) == []
-        shots(page, f"{where}-unfinished")
-        assert browser.complaints == []
+def test_it_speaks_latvian_and_fits_a_phone(studio: Fixture, look: Fixture) -> None:
+    server, browser = studio("--device", CALM, "--speed", "3"), look(PHONE, True, "lv", touch=True)
+    page = browser.open(server.url + "/record?new=1")
+    assert axe(page) == []
+    marked(page, "code").fill("Anna B")
+    marked(page, "begin").click()
+    page.get_by_role("alert").filter(has_text="nav dalībnieka kods").wait_for()
+    assert axe(page) == []
+    own_list(page)
+    marked(page, "code").fill("S01")
+    choose(page, "protocol", "Izmēģināšanai")
+    marked(page, "begin").click()
+    sat(page, "S01/1")
+    assert marked(page, "prompt").inner_text() == "Glaudi rotaļlietai muguru; rotaļlieta stāv uz galda"
+    assert marked(page, "gesture").inner_text() == "Muguras glāstīšana 1"
+    assert marked(page, "simulation").is_visible()
+    assert marked(page, "picture").locator("svg").get_attribute("aria-label")
+    page.wait_for_function("() => document.querySelectorAll('[data-test^=plot-] canvas').length === 3")
+    for name in ("gesture", "prompt", "state-box", "main"):
+        box = marked(page, name).bounding_box()
+        assert box is not None and box["y"] + box["height"] <= PHONE[1], f"{name} is visible without scrolling"
+    for state in ("idle", "recording"):
+        if state == "recording":
+            marked(page, "main").click()
+        showing(page, f"{state}.0.")
+        assert axe(page) == [], state
+    assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
+    marked(page, "main").click()
+    showing(page, "idle.1.")
+    for expected in ("idle.2.", "idle.3.", "finished."):
+        page.keyboard.press("s")
+        showing(page, expected)
+    assert axe(page) == []
+    marked(page, "redo").click()
+    showing(page, "idle.0.")
+    page.keyboard.press("p")
+    showing(page, "paused.0.")
+    marked(page, "end").click()
+    marked(page, "end-yes").wait_for()
+    assert axe(page) == []
+    marked(page, "end-yes").click()
+    page.wait_for_url("**/record?ended=S01/1")
+    connected(page)
+    assert marked(page, "unfinished-S01/1").is_visible()
+    assert axe(page) == []
+    assert browser.complaints == []

@@ -20,7 +20,7 @@ from plushsense.recording.writer import SessionEvent, SessionHead, read_events
 from plushsense.studio.app import toys
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.record.controller import MARKERS, NO_CONSENT, PSEUDO, ActiveSession, RecordController
-from plushsense.studio.pages.record.result import measure_result
+from plushsense.studio.pages.record.last_recording import measure_result
 from support.recording_pages import CALM, tcp_toy
 from support.waiting import until
 

@@ -14,8 +14,6 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.trimming import row_times_s, suggest_trims
-from plushsense.studio.app.selections import Selections
-from plushsense.studio.app.workspace import Workspace
 from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
 from support.reviewed import ROW_S, made, marks, raw_hash, streamed
 
@@ -256,9 +254,7 @@ def test_keys_are_no_commands_while_something_else_has_them(waves: Path, studio:
     assert browser.complaints == []
 
 
-def test_excluding_needs_a_reason_and_is_taken_back(
-    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
+def test_excluding_needs_a_reason_and_is_taken_back(waves: Path, studio: Fixture, look: Fixture) -> None:
     browser = look()
     page = browser.open(studio(home=waves.parents[1]).url + "/review?view=one")
     first = opened(page)
@@ -267,7 +263,6 @@ def test_excluding_needs_a_reason_and_is_taken_back(
     marked(page, "reason-go").click()
     page.get_by_text("A reason is missing").wait_for()
     assert axe(page) == []
-    shots(page, "review-dialog-en-light")
     marked(page, "own-reason").fill("a dog barked")
     marked(page, "own-reason").press("Enter")
     page.wait_for_function("([plot, was]) => document.querySelector(plot).dataset.recording !== was", arg=[PLOT, first])
@@ -312,9 +307,7 @@ def test_a_finding_is_accepted_with_a_reason(waves: Path, studio: Fixture, look:
 
 
 @pytest.mark.exhaustive
-def test_the_table_filters_sorts_and_says_what_it_shows(
-    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
+def test_the_table_filters_sorts_and_says_what_it_shows(waves: Path, studio: Fixture, look: Fixture) -> None:
     append_marks(waves, [Mark(open_dataset(waves).recordings[0].id, "exclude", "x", "y")])
     url = studio(home=waves.parents[1]).url
     for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
@@ -324,7 +317,6 @@ def test_the_table_filters_sorts_and_says_what_it_shows(
         checked(page)
         assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth"), "no sideways scrolling"
         assert axe(page) == []
-        shots(page, f"review-table-{language}-{'dark' if dark else 'light'}")
         assert browser.complaints == []
     page = look().open(url + "/review")
     rows = page.locator("[data-test=table] tbody tr")
@@ -418,7 +410,7 @@ def test_decisions_about_many_recordings(waves: Path, studio: Fixture, look: Fix
 
 
 @pytest.mark.exhaustive
-def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
+def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: Fixture) -> None:
     url = studio(home=waves.parents[1]).url
     longest = max(open_dataset(waves).recordings, key=lambda r: r.rows).id
     for language, dark, size in (("lv", True, PHONE), ("en", False, DESK)):
@@ -426,7 +418,6 @@ def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: F
         page = browser.open(url + "/review?view=durations&gesture=Wave")
         marked(page, "duration-outliers").get_by_text(longest).wait_for()
         assert axe(page) == []
-        shots(page, f"review-durations-{language}-{'dark' if dark else 'light'}")
         assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
         assert browser.complaints == []
     assert "Recordings: 21. Mean 2.74 s, median 2.50 s" in marked(page, "durations-summary").inner_text()
@@ -456,17 +447,13 @@ def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: F
 
 
 @pytest.mark.exhaustive
-def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
+def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixture) -> None:
     url = studio(home=waves.parents[1]).url
     longest = max(open_dataset(waves).recordings, key=lambda r: r.rows).id
-    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
-        browser = look(size, dark, language)
-        page = browser.open(url + "/review?view=overlay&gesture=Wave")
-        page.wait_for_selector(f"[data-test=outliers] :text('{longest}')")
-        assert axe(page) == []
-        shots(page, f"review-overlay-{language}-{'dark' if dark else 'light'}")
-        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
-        assert browser.complaints == []
+    page = look(TABLET, True, "lv").open(url + "/review?view=overlay&gesture=Wave")
+    page.wait_for_selector(f"[data-test=outliers] :text('{longest}')")
+    assert axe(page) == []
+    assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
     marked(page, "outliers").get_by_role("button").first.click()
     assert opened(page) == longest
     page = look().open(url + "/review?view=overlay&gesture=Wave")
@@ -477,61 +464,6 @@ def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixtu
     # Where all others have ended, only one is left.
     over.click(position={"x": int(box["width"] * 0.75), "y": int(box["height"] * 0.5)})
     assert opened(page) == longest
-
-
-@pytest.mark.exhaustive
-def test_one_recording_has_no_violation_in_any_light(
-    waves: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
-    url = studio(home=waves.parents[1]).url
-    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET), ("lv", False, DESK), ("en", True, TABLET)):
-        browser = look(size, dark, language, touch=size == TABLET)
-        page = browser.open(url + "/review?view=one&gesture=Wave")
-        opened(page)
-        checked(page)
-        page.keyboard.press("ArrowRight")
-        state(page, "draft")
-        assert axe(page) == []
-        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
-        shots(page, f"review-one-{language}-{'dark' if dark else 'light'}")
-        page.keyboard.press("x")
-        page.wait_for_selector("[data-test=reason]")
-        assert axe(page) == []
-        page.keyboard.press("Escape")
-        page.wait_for_selector("[data-test=reason]", state="detached")
-        page.keyboard.press("s")
-        state(page, "suggested")
-        assert browser.complaints == []
-    assert marks(waves) == []
-
-
-@pytest.mark.exhaustive
-def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> None:
-    started = studio(home=waves.parents[1])
-    ids = [r.id for r in open_dataset(waves).recordings if r.gesture == "Wave"]
-    reviews = Selections(Workspace(waves.parents[1]))
-    browser = look()
-    page = browser.open(started.url + reviews.address(waves, ids[3:6], "Wave taken for Rest"))
-    page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 3")
-    assert "Only the linked recordings (3). Wave taken for Rest" in marked(page, "selection").inner_text()
-    marked(page, "start").click()
-    assert opened(page) == ids[3]
-    checked(page)
-    pressed(page, "Enter")
-    pressed(page, "Enter")
-    page.keyboard.press("Enter")
-    page.get_by_text("the last recording of this list").wait_for()
-    assert [m["recording"] for m in marks(waves)] == ids[3:6]
-    page = browser.open(started.url + reviews.address(waves, [*ids, *(f"P9/gone_{i}" for i in range(99))], "many"))
-    page.wait_for_function(f"() => document.querySelectorAll('[data-test=table] tbody tr').length === {len(ids)}")
-    assert "not in this data set: 99" in marked(page, "message").inner_text()
-    page = browser.open(started.url + "/review?recording=P1/none")
-    page.get_by_text("There is no recording “P1/none”").wait_for()
-    page = browser.open(started.url + "/review?selection=0000")
-    page.get_by_text("The selection “0000” does not exist").wait_for()
-    page = browser.open(started.url + "/review?dataset=/etc")
-    page.get_by_text("is not in the studio's folder").wait_for()
-    assert browser.complaints == []
 
 
 def test_a_folder_that_cannot_be_written(waves: Path, studio: Fixture, look: Fixture) -> None:
@@ -605,12 +537,6 @@ def test_a_broken_data_set_is_a_sentence(waves: Path, studio: Fixture, look: Fix
     assert browser.complaints == []
 
 
-def test_no_data_set_yet(tmp_path: Path, studio: Fixture, look: Fixture) -> None:
-    page = look().open(studio().url + "/review")
-    page.get_by_text("There is no data set yet").wait_for()
-    assert axe(page) == []
-
-
 def test_labelled_recordings_need_no_trimming(real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture) -> None:
     source = tmp_path / "har"
     source.mkdir()
@@ -642,9 +568,7 @@ def test_labelled_recordings_need_no_trimming(real_data: Path, tmp_path: Path, s
 STREAM = "[data-test=stream-plot]"
 
 
-def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
-    tmp_path: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
+def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(tmp_path: Path, studio: Fixture, look: Fixture) -> None:
     place = streamed(tmp_path / "home" / "datasets" / "streams")
     browser = look()
     page = browser.open(studio(home=tmp_path / "home").url + "/review?view=stream")
@@ -688,7 +612,6 @@ def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
     page.keyboard.press("h")
     page.wait_for_selector("[data-test=stretches] :text('Handling')")
     assert axe(page) == []
-    shots(page, "review-stream-en-light")
     lines = [(m["recording"], m["action"], m["label"]) for m in marks(place)]
     assert lines == [("P1/fulldatastream", "label", k) for k in ("rest", "practice:Wave", "handling")]
     assert [(m["start"], m["stop"]) for m in marks(place)] == [
@@ -718,9 +641,7 @@ def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
 
 
 @pytest.mark.exhaustive
-def test_real_recordings_one_after_the_other(
-    real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture, shots: Fixture
-) -> None:
+def test_real_recordings_one_after_the_other(real_data: Path, tmp_path: Path, studio: Fixture, look: Fixture) -> None:
     place = tmp_path / "home" / "datasets" / "real"
     place.parent.mkdir(parents=True)
     import_recordings(real_data / "makeability-gestures", place, layout="accel-3")
@@ -736,7 +657,6 @@ def test_real_recordings_one_after_the_other(
     assert [m["recording"] for m in marks(place)] == seen[:25]
     times = page.evaluate(f"() => document.querySelector('{PLOT}').psPlot.times")
     assert len(times) == 25
-    shots(page, "review-real-en-light")
     # The one that nobody stopped, 18907 rows: drawn thinned, closer in full.
     longest = max(open_dataset(place).recordings, key=lambda r: r.rows)
     page.goto(page.url.split("?")[0] + f"?recording={longest.id.replace(' ', '%20')}")

@@ -213,10 +213,10 @@ def test_what_is_drawn_is_what_was_recorded(review: Review) -> None:
     read = review.signals(first)
     shown = read.curves(ALL)
     frames = review.dataset.read(review.infos[first])
-    assert np.array_equal(np.array(shown["curves"]).T[-len(frames) :], frames.values)
-    assert shown["unit"] == "count"
+    assert np.array_equal(np.array(shown.curves).T[-len(frames) :], frames.values)
+    assert shown.unit == "count"
     assert read.row_at(0.123) == 12 and read.row_at(99.0) == 250 and read.row_at(-3.0) == 0
-    assert len(read.curves(ACTIVITY)["x"]) == 250
+    assert len(read.curves(ACTIVITY).x) == 250
     assert read.seconds[1] == pytest.approx(ROW_S)
 
 
@@ -233,12 +233,12 @@ def test_long_recordings_are_thinned_to_their_extremes(workspace: Workspace) -> 
     layout = open_dataset(workspace.folder / "datasets" / "waves").layout
     read = RecordingSignals(info, layout, np.append(at, 200.0), at, values, np.zeros(20_000))
     shown = read.curves(ALL)
-    assert shown["thinned"] and len(shown["x"]) <= 3200
-    assert max(v for v in shown["curves"][0] if v is not None) == 99_999.0
-    assert None in shown["curves"][0]
+    assert shown.thinned and len(shown.x) <= 3200
+    assert max(v for v in shown.curves[0] if v is not None) == 99_999.0
+    assert None in shown.curves[0]
     near = read.curves(ALL, 100.0, 110.0)
-    assert not near["thinned"] and sum(100.0 <= x <= 110.0 for x in near["x"]) >= 1000
-    assert (near["x"][0], near["x"][-1]) == (0.0, at[-1])
+    assert not near.thinned and sum(100.0 <= x <= 110.0 for x in near.x) >= 1000
+    assert (near.x[0], near.x[-1]) == (0.0, at[-1])
 
 
 def test_an_overlay_names_what_stands_out(review: Review) -> None:
@@ -287,7 +287,6 @@ def test_a_folder_that_cannot_be_written_loses_nothing(review: Review) -> None:
     with pytest.raises(DatasetError, match=r"marks.jsonl' cannot be written"):
         review.accept(VISIT, first, ME)
     assert review.draft(first) == (20, 250)
-    assert review.history(VISIT) == ()
     (review.path / "marks.jsonl.lock").rmdir()
     assert review.accept(VISIT, first, ME)
     assert review.standing(first).start == 20

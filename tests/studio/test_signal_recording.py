@@ -16,9 +16,9 @@ from plushsense.recording import writer
 from plushsense.recording.session import next_session
 from plushsense.recording.writer import SessionHead, StreamFile, read_events
 from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
-from plushsense.studio.pages.live.state import LiveChoice
 from support.bundles import odd_bundle
 from support.waiting import until
 

@@ -45,8 +45,8 @@ KILLED, CLOSED = len(ASKED) // 3, len(ASKED) // 2
 class Therapist:
     """What she does on a page: read, press what is written there, fill in fields."""
 
-    def __init__(self, page: Page, shots: Callable[[Page, str], None]) -> None:
-        self.page, self.shots, self.times = page, shots, dict[str, float]()
+    def __init__(self, page: Page) -> None:
+        self.page, self.times = page, dict[str, float]()
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
@@ -62,7 +62,6 @@ class Therapist:
         assert english(self.page) == [], name
         assert axe(self.page) == [], name
         assert self.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), name
-        self.shots(self.page, f"therapist-{name}")
 
     def press(self, text: str, exact: bool = True) -> None:
         """Press the button, link or menu item with this text."""
@@ -91,10 +90,10 @@ def record(t: Therapist, first: int, last: int) -> None:
         showing(t.page, f"idle.{number + 1}.", "finished.")
 
 
-def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
+def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     server = studio("--speed", f"{SPEED}")
     browser = look(language="lv", own=True)
-    t = Therapist(browser.open(server.url), shots)
+    t = Therapist(browser.open(server.url))
 
     with t.step("first child"):
         t.press(W("Record"))

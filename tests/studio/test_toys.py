@@ -13,7 +13,7 @@ from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.devices import base
 from plushsense.devices.opening import DeviceListing, list_devices
 from plushsense.studio.app import toys as room
-from plushsense.studio.app.toys import PERSONS, Toys
+from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import Workspace
 
 
@@ -42,16 +42,6 @@ def test_looking_does_not_wait_and_rings(toys: Toys, monkeypatch: pytest.MonkeyP
         time.sleep(0.02)
     assert [d.kind for d in toys.listing.devices][-1] == "virtual"
     assert looks == [(0.2, False)]
-
-
-def test_a_person_of_the_virtual_toy(toys: Toys) -> None:
-    assert toys.person(PERSONS) == f"virtual://?person={PERSONS}"
-    assert toys.simulated
-    toys.choose("tcp://127.0.0.1:9")
-    assert not toys.simulated
-    for number in (0, PERSONS + 1, -1):
-        with pytest.raises(ConfigError, match="no virtual person"):
-            toys.person(number)
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,10 @@ from plushsense.models.bundle import Bundle
 from plushsense.studio.app.jobs import Jobs, StudioJob
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.train.jobs import progress_charts
-from plushsense.studio.pages.train.requests import JobRequest, free_name, grids, job_request
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.job_cards import progress_charts
+from plushsense.studio.pages.train.job_requests import JobRequest, free_name, grids, job_request
+from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_rows, pareto_table
+from plushsense.studio.pages.train.stored_results import (
     TRAINING,
     Confusion,
     ResultRow,
@@ -31,7 +32,6 @@ from plushsense.studio.pages.train.results import (
     recordings_of_cell,
     sum_by_affect,
 )
-from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_rows, pareto_table
 from plushsense.studio.tasks import Clock
 from plushsense.workflow.config import from_settings
 
@@ -117,7 +117,7 @@ def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.Monkey
         job_request(workspace, jobs, form)
     again = {"dataset": form["dataset"], "kind": "evaluate", "split": "by-subject:5"}
     proof = job_request(workspace, jobs, again)
-    jobs.start(proof.task, proof.dry, proof.title)
+    jobs.start(proof.task, proof.spec | {"dry": True}, proof.title)
     job_request(workspace, jobs, again)
     jobs.start(proof.task, proof.spec, proof.title)
     with pytest.raises(ConfigError, match="running already"):

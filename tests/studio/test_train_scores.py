@@ -18,7 +18,7 @@ from plushsense.scoring.metrics import accuracy_over_people
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.train.result_details import confusion_table, worst_table
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.stored_results import (
     EVALUATION,
     TRAINING,
     TRIAL,
@@ -27,7 +27,6 @@ from plushsense.studio.pages.train.results import (
     StoredResults,
     counted,
     figure,
-    whole,
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits, of_ten, people_table
 from support.sweeping import keys
@@ -164,7 +163,7 @@ def test_a_verdict_names_its_limits(home: Path) -> None:
     assert latvian[0].startswith("Pārbaudē piedalījās 21 cilvēks.") and "vēl 2 cilvēkiem" in latvian[1]
     assert [counted(w, "folds", n) for n in (1, 2)] == ["1 fold", "2 folds"]
     assert [counted(Words("lv"), "folds", n) for n in (1, 2, 11, 21)] == ["1 daļa", "2 daļas", "11 daļas", "21 daļa"]
-    assert (whole(w, 7118), whole(Words("lv"), 7118)) == ("7,118", "7\u00a0118")
+    assert (w.count(7118), Words("lv").count(7118)) == ("7,118", "7\u00a0118")
 
 
 def test_the_worst_confusions_come_first() -> None:

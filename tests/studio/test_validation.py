@@ -13,9 +13,9 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import load_gestures
 from plushsense.recording.writer import read_events
 from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
-from plushsense.studio.pages.live.state import LiveChoice
 from plushsense.studio.pages.live.validation import GESTURE_S, Validation
 from support.bundles import odd_bundle
 from support.waiting import until

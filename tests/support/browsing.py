@@ -58,7 +58,7 @@ DESK, TABLET, PHONE = (1280, 800), (820, 1180), (390, 844)
 # Importing takes longer than starting: a server process imports once, and every studio is forked from it.
 _FORKING = multiprocessing.get_context("forkserver")
 _FORKING.set_forkserver_preload(
-    ["nicegui", "plushsense.studio.app.serve", *(f"plushsense.studio.pages.{name}.page" for name in PAGES)]
+    ["nicegui", "plushsense.studio.app.serve", *(f"plushsense.studio.pages.{name}.{name}_page" for name in PAGES)]
 )
 
 
@@ -253,8 +253,14 @@ def axe(page: Page) -> list[str]:
     """Serious and critical findings of axe-core, a line each, that are still there after a moment.
 
     A field that is just being enabled, or a label that is moving, may be found in between. Nothing is preloaded: only a
-    rule on films and sounds, of moderate impact, needs that, and it takes as long as all the rules.
+    rule on films and sounds, of moderate impact, needs that, and it takes as long as all the rules. In the folder
+    ``PLUSHSENSE_LOOKS``, if set, a picture of the page is kept for looking at.
     """
+    if folder := os.environ.get("PLUSHSENSE_LOOKS"):
+        name = re.sub(r"\W+", "-", os.environ["PYTEST_CURRENT_TEST"].rpartition("::")[2].partition(" (")[0])
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        number = len(list(Path(folder).glob(f"{name}-*.png")))
+        page.screenshot(path=str(Path(folder) / f"{name}-{number}.png"), full_page=True)
     # Evaluated, not added as a script: the page's own policy stands. Once a page, as that takes as long as looking.
     if not page.evaluate("() => 'axe' in window"):
         page.evaluate(AXE.read_text(encoding="utf-8"))

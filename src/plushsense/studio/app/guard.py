@@ -1,42 +1,31 @@
 """Control access to the studio: admit local requests or those with a one-time token; forbid content from elsewhere.
 
-`Guard` wraps the whole application, including NiceGUI's own routes and its websocket. `limited_protocol` limits the
-number of open connections and the time a request may take to arrive, because each connection uses a file descriptor
-of the process that also records.
+`Guard` wraps the whole application, including NiceGUI's own routes and its websocket.
 """
 
 from __future__ import annotations
 
-import asyncio
 import hmac
 import io
 import ipaddress
 import secrets
-import time
 import zipfile
-from collections.abc import Awaitable, Callable, Iterable, Iterator
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Iterable
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 from fastapi import APIRouter
-from fastapi.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from jinja2 import ChoiceLoader, DictLoader, Environment
 from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.importing.archives import zip_entry
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.deploy.code import FACTS
 from plushsense.studio.app.workspace import BACKUPS, EXPORTS, PACKAGES, Workspace
-
-Scope = dict[str, Any]
-Receive = Callable[[], Awaitable[dict[str, Any]]]
-Send = Callable[[dict[str, Any]], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 COOKIE = "plushsense_visitor"
 TOKEN = "token"
@@ -154,7 +143,7 @@ class Visitors:
 class Guard:
     """ASGI middleware that rejects browsers not admitted by `Visitors`, limits bodies and sets security headers."""
 
-    def __init__(self, app: App, visitors: Visitors) -> None:
+    def __init__(self, app: ASGIApp, visitors: Visitors) -> None:
         self._app, self._visitors = app, visitors
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -171,12 +160,13 @@ class Guard:
             else:
                 await _refuse(scope, send, 401, _TOKEN_NEEDED)
         elif not self._visitors.open and scope["method"] == "GET" and (visitor := self._visitors.admit(query)):
-            await _to_start(send, "" if self._visitors.admits(headers) else visitor)
+            await _to_start(scope, send, "" if self._visitors.admits(headers) else visitor)
         elif self._visitors.admits(headers):
             await _bounded(self._app, scope, receive, send, headers)
         elif scope["path"] == "/" and query == WELCOME:
             # After a link from another page, a browser does not send the SameSite cookie with its first request.
-            await _answer(send, 200, b'<!doctype html><meta http-equiv="refresh" content="0;url=/">', "text/html")
+            page = '<!doctype html><meta http-equiv="refresh" content="0;url=/">'
+            await _answer(scope, send, HTMLResponse(page, headers=_CLOSE))
         else:
             await _refuse(scope, send, 401, _TOKEN_NEEDED)
 
@@ -184,7 +174,7 @@ class Guard:
 _TOKEN_NEEDED = "This studio can only be opened with the address that it printed at start; its token is valid once."
 
 
-async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
+async def _bounded(app: ASGIApp, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
     """Call ``app``, limit the size of the request body (even if its length is unknown) and add security headers."""
     limit = UPLOAD_BYTES if _is_upload(scope) else BODY_BYTES
     refusal = f"This is larger than the {limit / 1e6:g} MB that are accepted here."
@@ -195,7 +185,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
     received, too_large, started, disconnected = 0, False, False, False
     scope[NONCE] = nonce = secrets.token_urlsafe(16)
 
-    async def receiving() -> dict[str, Any]:
+    async def receiving() -> Message:
         nonlocal received, too_large, disconnected
         if too_large:
             return {"type": "http.disconnect"}
@@ -207,7 +197,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
             return {"type": "http.disconnect"}
         return message
 
-    async def sending(message: dict[str, Any]) -> None:
+    async def sending(message: Message) -> None:
         nonlocal started
         if too_large and not started:
             return
@@ -233,260 +223,38 @@ def _is_upload(scope: Scope) -> bool:
     return bool(scope["method"] == "POST" and parts[1:3] == ["_nicegui", "client"] and parts[4:5] == ["upload"])
 
 
-async def _to_start(send: Send, visitor: str) -> None:
+_CLOSE = {"connection": "close"}
+
+
+async def _to_start(scope: Scope, send: Send, visitor: str) -> None:
     """Redirect to the home page, which removes the token from the address, and set the cookie ``visitor`` if given."""
-    headers = [
-        (b"location", f"/?{WELCOME}".encode()),
-        (b"cache-control", b"no-store"),
-        *_security_headers(secrets.token_urlsafe(16)),
-    ]
+    response = RedirectResponse(f"/?{WELCOME}", 303)
     if visitor:
-        headers.append((b"set-cookie", f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict".encode()))
-    await send({"type": "http.response.start", "status": 303, "headers": headers})
-    await send({"type": "http.response.body", "body": b""})
+        response.set_cookie(COOKIE, visitor, httponly=True, samesite="strict")
+    await _answer(scope, send, response)
 
 
 async def _refuse(scope: Scope, send: Send, status: int, message: str) -> None:
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 1008, "reason": message[:100]})
-    else:
-        await _answer(send, status, f"{message}\n".encode(), "text/plain")
+        return
+    # Close the connection, except after 413: a browser reads that response only after sending the whole body.
+    await _answer(scope, send, PlainTextResponse(f"{message}\n", status, headers=None if status == 413 else _CLOSE))
 
 
-async def _answer(send: Send, status: int, body: bytes, kind: str) -> None:
-    headers = [(b"content-type", f"{kind}; charset=utf-8".encode()), (b"cache-control", b"no-store")]
-    headers += _security_headers(secrets.token_urlsafe(16))
-    if status != 413:
-        # Close the connection, except after 413: a browser reads that response only after sending the whole body.
-        headers.append((b"connection", b"close"))
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+async def _answer(scope: Scope, send: Send, response: Response) -> None:
+    """Send a response that is not that of the application."""
+    response.headers["cache-control"] = "no-store"
+    response.raw_headers += _security_headers(secrets.token_urlsafe(16))
+    await response(scope, _nothing, send)
 
 
-# Connections ------------------------------------------------------------------------------------------------------
-
-_MOST, _MOST_PER_PEER = 256, 32
-"""Default limits: all connections, and those of one peer. A browser opens up to six, plus a websocket per page."""
-
-
-@dataclass(frozen=True)
-class ConnectionLimits:
-    """Limits on the number of open connections and on how long each may wait.
-
-    Attributes:
-        total: maximum number of connections; ``per_peer`` of them are reserved for browsers on this computer.
-        per_peer: maximum number of connections of one peer, see `peer_of`.
-        head_s: maximum time from connecting, or from the previous response, until the head of a request is complete.
-        body_s: maximum time without new data while the body of a request is incomplete, or in which the client reads
-            nothing of a response.
-        keep_alive_s: time after a response until a connection without a new request is closed.
-        backlog: maximum number of connections waiting to be accepted; each is open briefly before it can be refused.
-    """
-
-    total: int = _MOST
-    per_peer: int = _MOST_PER_PEER
-    head_s: float = 10.0
-    body_s: float = 30.0
-    keep_alive_s: int = 5
-    backlog: int = 128
-
-    @classmethod
-    def of_process(cls) -> ConnectionLimits:
-        """Return limits that let connections use at most a quarter of this process's file descriptors."""
-        try:
-            import resource
-        except ImportError:  # Windows, where sockets do not count as open files
-            return cls()
-        files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        total = _MOST if files == resource.RLIM_INFINITY else max(4, min(_MOST, files // 4))
-        return cls(total=total, per_peer=min(_MOST_PER_PEER, total // 2), backlog=total // 2)
-
-
-@lru_cache(maxsize=1024)
-def peer_of(client: str, server: str) -> str:
-    """Return the name under which the connections of a client are counted.
-
-    The name is "" for this computer, whichever of its addresses is used. Otherwise it is the IPv4 address, or the /64
-    network of an IPv6 address, because a host can choose the remaining bits itself.
-    """
-    try:
-        address = ipaddress.ip_address(client.partition("%")[0])
-    except ValueError:
-        return client
-    if isinstance(address, ipaddress.IPv6Address):
-        address = address.ipv4_mapped or address
-    if address.is_loopback or client == server:
-        return ""
-    return str(ipaddress.ip_network((address, 64), strict=False) if address.version == 6 else address)
-
-
-class _WriteWatch(asyncio.Protocol):
-    """Part of uvicorn's protocol classes: notes since when a client has not read what was sent."""
-
-    _blocked_since: float | None = None
-
-    def pause_writing(self) -> None:
-        self._blocked_since = time.monotonic()
-        super().pause_writing()
-
-    def resume_writing(self) -> None:
-        self._blocked_since = None
-        super().resume_writing()
-
-
-def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
-    """Return a protocol class that enforces ``limits``, to pass to uvicorn as ``http``.
-
-    uvicorn limits the time *after* a response and the length of a head, but not the time a request takes to arrive.
-    Its ``limit_concurrency`` answers complete requests with 503 but keeps incomplete ones open. This class closes the
-    connection that has been idle longest to make room for a new one.
-    """
-    import h11
-    from uvicorn.protocols.http.h11_impl import H11Protocol
-
-    def peer(connection: Any) -> str:
-        client, server = connection.client, connection.server
-        return peer_of(client[0] if client else "?", server[0] if server else "")
-
-    class LimitedProtocol(_WriteWatch, H11Protocol):
-        """An HTTP connection, until it is closed or upgraded to a websocket."""
-
-        # By time.monotonic, because the clock of uvloop counts whole milliseconds.
-        _idle_since = _data_at = 0.0
-        _timer: Any = None
-
-        def __init__(self, *args: Any, **options: Any) -> None:
-            super().__init__(*args, **options)
-            base: Any = self.ws_protocol_class
-            self.ws_protocol_class = base and limited_websocket(limits, base)
-
-        def connection_made(self, transport: Any) -> None:
-            super().connection_made(transport)
-            self._idle_since = time.monotonic()
-            if self._find_room():
-                self._timer = self.loop.call_later(limits.head_s, self._expire)
-            else:
-                self._drop()
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            if self._timer is not None:
-                self._timer.cancel()
-            super().connection_lost(exc)
-
-        def data_received(self, data: bytes) -> None:
-            self._data_at = time.monotonic()
-            super().data_received(data)
-
-        def on_response_complete(self) -> None:
-            self._idle_since = time.monotonic()
-            super().on_response_complete()
-
-        @property
-        def _idle(self) -> bool:
-            """True if the connection is waiting for the head of a request and has nothing left to send."""
-            if self.conn.their_state is h11.SEND_BODY or self.transport.get_write_buffer_size():
-                return False
-            return self.cycle is None or self.cycle.response_complete
-
-        def _find_room(self) -> bool:
-            """Return whether this connection may stay, after dropping an idle one if necessary."""
-            own_peer = peer(self)
-            others = [(peer(c), c) for c in self.connections if c is not self]
-            rivals = [c for name, c in others if name == own_peer]
-            if len(rivals) < limits.per_peer:
-                # The connections reserved for this computer are not available to other peers.
-                rivals = [c for name, c in others if name] if own_peer else []
-                if len(rivals) < limits.total - limits.per_peer:
-                    return True
-            idle = [c for c in rivals if isinstance(c, LimitedProtocol) and c._idle]
-            if idle:
-                min(idle, key=lambda c: c._idle_since)._drop()
-            return bool(idle)
-
-        def _drop(self) -> None:
-            # Remove it now: the transport reports the closing only in the next iteration of the event loop.
-            self.connections.discard(self)
-            self.transport.abort()
-
-        def _expire(self) -> None:
-            """Drop the connection if the rest of a request or reading the response is overdue; else check later."""
-            now = time.monotonic()
-            if self not in self.connections:
-                return  # it is a websocket now
-            left = limits.head_s
-            if self._blocked_since is not None:
-                left = self._blocked_since + limits.body_s - now
-            elif self.conn.their_state is h11.SEND_BODY:
-                if self.flow.read_paused:
-                    self._data_at = now
-                left = self._data_at + limits.body_s - now
-            elif self._idle:
-                left = self._idle_since + limits.head_s - now
-            if left <= 0.0:
-                self._drop()
-            else:
-                self._timer = self.loop.call_later(min(left, limits.head_s), self._expire)
-
-    return LimitedProtocol
-
-
-@lru_cache(maxsize=4)
-def limited_websocket(limits: ConnectionLimits, base: Any) -> type[Any]:
-    """Return uvicorn's websocket protocol class ``base`` with an end to connections whose client does not read.
-
-    uvicorn's pings end such a connection too, but it stays open until the client has read everything that was sent.
-    """
-
-    class LimitedWebSocket(_WriteWatch, base):  # type: ignore[misc]
-        """A websocket that is aborted if its client reads nothing, or does not close it, for ``limits.body_s``."""
-
-        _closing = False
-        _check: Any = None
-
-        def connection_made(self, transport: Any) -> None:
-            super().connection_made(transport)
-            self._check = self.loop.call_later(limits.body_s / 2, self._expire)
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            self._check.cancel()
-            super().connection_lost(exc)
-
-        def _expire(self) -> None:
-            blocked = self._blocked_since is not None and time.monotonic() - self._blocked_since >= limits.body_s
-            if blocked or self._closing:
-                self.transport.abort()
-                return
-            self._closing = self.transport.is_closing()
-            self._check = self.loop.call_later(limits.body_s / 2, self._expire)
-
-    return LimitedWebSocket
-
-
-UNSENT_MESSAGES, UNSENT_BYTES = 1000, 1 << 26
-"""Most messages, and most characters in them, that may wait for a client; it reads 25 a second on the page Live."""
-
-
-async def drop_slow_clients(server: Any, most: int = UNSENT_MESSAGES, most_bytes: int = UNSENT_BYTES) -> None:
-    """End the connections of an Engine.IO server for which more messages wait; a browser connects anew.
-
-    A client that reads less than it is sent, or never asks for its messages, stays connected as long as it answers
-    pings, and Engine.IO's queue of messages for it has no limit.
-    """
-    for connection in list(server.sockets.values()):
-        waiting = connection.queue
-        size = sum(len(packet.data or "") for packet in waiting._queue if packet is not None)
-        if connection.closed or (waiting.qsize() <= most and size <= most_bytes):
-            continue
-        await connection.close(wait=False, abort=True)
-        while not waiting.empty():
-            waiting.get_nowait()
-            waiting.task_done()
-        waiting.put_nowait(None)  # ends the writer
+async def _nothing() -> Message:
+    return {"type": "http.disconnect"}
 
 
 # Downloads --------------------------------------------------------------------------------------------------------
 
-_CHUNK = 1 << 16
 _MAX_NAME = 255
 """Maximum length of a file name in bytes; file systems report longer names in different ways."""
 
@@ -510,7 +278,7 @@ def router(workspace: Workspace) -> APIRouter:
             return PlainTextResponse(f"{refusal}\n", 404)
         if kind == EXPORTS and (path / FACTS).is_file():
             headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(path.name, safe='')}.zip"}
-            return StreamingResponse(zip_chunks(path), media_type="application/zip", headers=headers)
+            return Response(zip_of(path), media_type="application/zip", headers=headers)
         if kind != EXPORTS and path.is_file():
             return FileResponse(path, media_type="application/zip", filename=path.name)
         return PlainTextResponse(f"There is no {kind.removesuffix('s')} '{name}' in this studio.\n", 404)
@@ -534,38 +302,11 @@ def path_in(workspace: Workspace, kind: str, name: str) -> Path:
     return place
 
 
-def zip_chunks(folder: Path) -> Iterator[bytes]:
-    """Yield a zip archive of a folder in chunks while it is being built; equal files give equal bytes.
-
-    Links to places outside the folder are left out.
-    """
-    pipe = _Pipe()
-    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:
+def zip_of(folder: Path) -> bytes:
+    """Return a zip archive of an export; equal files give equal bytes. Links to places outside are left out."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
         for path in list_package_files(folder):
-            if folder.resolve() not in path.resolve().parents:
-                continue
-            entry = zip_entry(f"{folder.name}/{path.relative_to(folder).as_posix()}")
-            with path.open("rb") as source, archive.open(entry, "w") as target:
-                while chunk := source.read(_CHUNK):
-                    target.write(chunk)
-                    yield pipe.take()
-    yield pipe.take()
-
-
-class _Pipe(io.RawIOBase):
-    """Buffer between `zipfile` and the response. It is not seekable, so `zipfile` writes sizes after the data."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: object) -> int:
-        content = bytes(data)  # type: ignore[call-overload]
-        self._buffer += content
-        return len(content)
-
-    def take(self) -> bytes:
-        content, self._buffer = bytes(self._buffer), bytearray()
-        return content
+            if folder.resolve() in path.resolve().parents:
+                archive.writestr(zip_entry(f"{folder.name}/{path.relative_to(folder).as_posix()}"), path.read_bytes())
+    return packed.getvalue()

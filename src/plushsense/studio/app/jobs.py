@@ -18,8 +18,7 @@ from typing import Any
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.files import write_file
-from plushsense.core.sentences import Message
-from plushsense.studio.app.workspace import WORK, ChangeSignal, Workspace
+from plushsense.studio.app.workspace import WORK, ChangeSignal, Workspace, refusal_of
 
 UNFINISHED = ".unfinished-"
 """Prefix of temporary folders in the work folder; leftovers are removed when the studio starts."""
@@ -196,11 +195,7 @@ class Jobs:
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
         except OSError as cause:
-            where = cause.filename or self._folder
-            why = str(cause.strerror or cause)
-            message = Message("The computer refused: {why}{where}.", why=why, where=f" ('{where}')")
-            job.state, job.refusal = REFUSED, message.to_json()
-            job.ended_s = time.time()
+            job.state, job.refusal, job.ended_s = REFUSED, refusal_of(cause).to_json(), time.time()
             self.changed.notify()
             return
         self._processes[job.id] = process

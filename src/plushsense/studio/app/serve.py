@@ -21,17 +21,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from plushsense.core.errors import ConfigError, need
-from plushsense.studio.app.guard import (
-    HEAD_BYTES,
-    TOKEN,
-    ConnectionLimits,
-    Guard,
-    Visitors,
-    drop_slow_clients,
-    is_loopback,
-    limited_protocol,
-    mark_scripts,
-)
+from plushsense.studio.app.connections import ConnectionLimits, drop_slow_clients, limited_protocol
+from plushsense.studio.app.guard import HEAD_BYTES, TOKEN, Guard, Visitors, is_loopback, mark_scripts
 from plushsense.studio.app.workspace import WORK, Workspace
 
 PORT = 8137
@@ -81,24 +72,14 @@ def run(
     os.environ.pop("NICEGUI_REDIS_URL", None)
     with _without_clients():
         need("nicegui", "studio")
-        from nicegui import app, ui
-        from nicegui.client import templates
-
-    from plushsense.studio.app.guard import router
-    from plushsense.studio.app.shell import PAGES
+        from nicegui import app
 
     lock = _lock_folder(workspace)
     port = _free_port(host, port)
-    for name, path in PAGES.items():
-        ui.page(path, response_timeout=30.0)(_page(workspace, name))
-    app.include_router(router(workspace))
     everywhere = host in _EVERYWHERE
     if everywhere:
         names = (*names, socket.gethostname(), *_addresses())
     visitors = Visitors(host, names)
-    inner: Any = app.build_middleware_stack
-    # The guard must be the outermost layer, even around error responses; app.add_middleware would put it further in.
-    vars(app)["build_middleware_stack"] = lambda: Guard(inner(), visitors)
     host_name = (_addresses() or [socket.gethostname()])[0] if everywhere else host
     address = f"http://{f'[{host_name}]' if ':' in host_name else host_name}:{port}/"
     if not visitors.open:
@@ -109,23 +90,24 @@ def run(
         _wait_open(host_name, port)
         on_ready(workspace.invite() if workspace.invite else address)
 
-    limits = ConnectionLimits.of_process()
-    # NiceGUI warns about its own tasks that are still running at shutdown; users cannot act on that.
-    logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
-    mark_scripts(templates.env, "index.html")
-    # Switch off Quasar's loading bar, because it has no accessible name.
-    app.config.quasar_config["loadingBar"] = {"skipHijack": True}
-    app.config.vue_config_script = _ALERTS + _ICONS.read_text(encoding="utf-8") + app.config.vue_config_script
+    _configure(workspace, visitors)
     app.on_startup(lambda: threading.Thread(target=announce, daemon=True).start())
-    app.on_startup(_watch_clients)
-    app.on_delete(_release_memory())
-    app.on_shutdown(workspace.close)
+    _listen(host, port, show and visitors.open)
+    if lock is not None:
+        lock.release()
+
+
+def _listen(host: str, port: int, show: bool) -> None:
+    """Run the web server until it is interrupted."""
+    from nicegui import ui
+
+    limits = ConnectionLimits.of_process()
     ui.run(
         host=host,
         port=port,
         title="PlushSense",
         favicon=_ICON,
-        show=show and visitors.open,
+        show=show,
         reload=False,
         tailwind=False,
         show_welcome_message=False,
@@ -136,8 +118,31 @@ def run(
         backlog=limits.backlog,
         h11_max_incomplete_event_size=HEAD_BYTES,
     )
-    if lock is not None:
-        lock.release()
+
+
+def _configure(workspace: Workspace, visitors: Visitors) -> None:
+    """Add the pages, the guard and the tasks of the studio to NiceGUI's application."""
+    from nicegui import app, ui
+    from nicegui.client import templates
+
+    from plushsense.studio.app.guard import router
+    from plushsense.studio.app.shell import PAGES
+
+    for name, path in PAGES.items():
+        ui.page(path, response_timeout=30.0)(_page(workspace, name))
+    app.include_router(router(workspace))
+    inner: Any = app.build_middleware_stack
+    # The guard must be the outermost layer, even around error responses; app.add_middleware would put it further in.
+    vars(app)["build_middleware_stack"] = lambda: Guard(inner(), visitors)
+    # NiceGUI warns about its own tasks that are still running at shutdown; users cannot act on that.
+    logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
+    mark_scripts(templates.env, "index.html")
+    # Switch off Quasar's loading bar, because it has no accessible name.
+    app.config.quasar_config["loadingBar"] = {"skipHijack": True}
+    app.config.vue_config_script = _ALERTS + _ICONS.read_text(encoding="utf-8") + app.config.vue_config_script
+    app.on_startup(_watch_clients)
+    app.on_delete(_release_memory())
+    app.on_shutdown(workspace.close)
 
 
 @contextlib.contextmanager
@@ -222,7 +227,7 @@ def _page(workspace: Workspace, name: str) -> Callable[[], Any]:
 
         from plushsense.studio.app.shell import frame
 
-        module = importlib.import_module(f"plushsense.studio.pages.{name}.page")
+        module = importlib.import_module(f"plushsense.studio.pages.{name}.{name}_page")
         task = asyncio.current_task()
         assert task is not None
         # Stop building a page that was left meanwhile: the elements to which it would add others are deleted.

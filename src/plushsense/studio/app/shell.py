@@ -22,7 +22,7 @@ from nicegui.translations import translations
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.studio.app.words import LANGUAGES, PageTexts, Texts, Words
-from plushsense.studio.app.workspace import ChangeSignal, Workspace
+from plushsense.studio.app.workspace import ChangeSignal, Workspace, refusal_of
 
 _CONNECTION: Texts = {
     "connection_lost": "The connection to the studio is lost.",
@@ -100,8 +100,8 @@ PAGES = {
 }
 """The pages: maps name to path, in the order of the navigation bar.
 
-To add a page, add a line here and a folder ``pages/<name>`` with a module ``page``, whose function ``show(page)`` adds
-the content below the title. The folder's ``__init__`` holds its `PageTexts` as ``TEXTS``.
+To add a page, add a line here and a folder ``pages/<name>`` with a module ``<name>_page``, whose function
+``show(page)`` adds the content below the title. The folder's ``__init__`` holds its `PageTexts` as ``TEXTS``.
 """
 
 TOUR = "tour"
@@ -158,16 +158,13 @@ class Page:
         self._messages.clear()
         if not sentence:
             return
-        with self._messages:
-            role = "alert" if kind == "error" else "status"
-            box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap").props(f'role="{role}"')
-            with tag(box, "message"):
-                ui.label(sentence).classes("flex-grow")
-                if undo is not None:
-                    button("undo", self.words("Undo"), on_page(undo), "outline color=inherit")
-                icon_button(
-                    "close", self.words("Close this message"), lambda: self.say(""), "flat round dense color=inherit"
-                )
+        with self._messages, tag(message_row(kind), "message"):
+            ui.label(sentence).classes("flex-grow")
+            if undo is not None:
+                button("undo", self.words("Undo"), on_page(undo), "outline color=inherit")
+            icon_button(
+                "close", self.words("Close this message"), lambda: self.say(""), "flat round dense color=inherit"
+            )
 
     @contextmanager
     def show_errors(self) -> Iterator[None]:
@@ -177,11 +174,13 @@ class Page:
         except PlushSenseError as refusal:
             self.say(self.words.error(refusal), "error")
         except OSError as cause:
-            where = f" ('{cause.filename}')" if cause.filename else ""
-            self.say(
-                self.words("The computer refused: {why}{where}.", where=where, why=cause.strerror or str(cause)),
-                "error",
-            )
+            self.say(self.words.error(refusal_of(cause)), "error")
+
+
+def message_row(kind: Kind) -> ui.row:
+    """Add a coloured box for a message, which screen readers announce."""
+    box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap")
+    return box.props(f'role="{"alert" if kind == "error" else "status"}"')
 
 
 def visitor() -> tuple[Words, bool | None]:

@@ -20,8 +20,8 @@ from plushsense.devices.base import ConnectionGap, Device, Frame
 from plushsense.devices.opening import (
     DEFAULT_LAYOUT,
     SCAN_S,
+    DeviceInfo,
     DeviceListing,
-    check_address,
     is_virtual,
     list_devices,
     open_device,
@@ -29,6 +29,7 @@ from plushsense.devices.opening import (
     speed_of,
     with_speed,
 )
+from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.windows.clock import SampleClock
 
@@ -245,6 +246,17 @@ class ToyTrial:
     layout: str = ""
 
 
+def toy_title(words: Words, url: str) -> str:
+    """Return the text for a toy in a list: its URL, marked if the toy is virtual."""
+    return f"{words('Virtual toy (simulation)')} · {url}" if is_virtual(url) else url
+
+
+def described(words: Words, toy: DeviceInfo) -> str:
+    """Return the description of a toy that was found; that of a serial port is the text of the system."""
+    about = toy.description
+    return words.sentence(about) if isinstance(about, Message) else about
+
+
 def with_layout(url: str, layout: str) -> str:
     """Return the URL of a toy with another layout."""
     place, _, settings = url.partition("?")
@@ -299,10 +311,6 @@ class Toys:
         self.changed.notify()
         return url
 
-    def check(self, url: str) -> None:
-        """Raise an error if no toy can be at this address, see `check_address`."""
-        check_address(parse_url(url.strip()))
-
     def try_out(self) -> None:
         """Test the chosen toy in the background; `trial` has the state and the result."""
         trial = self.trial = ToyTrial(self._workspace.toy)
@@ -329,12 +337,6 @@ class Toys:
                 if name != given and self.test(with_layout(url, name)).fits:
                     return name
         return ""
-
-    def person(self, number: int) -> str:
-        """Choose the virtual toy used by virtual person ``number``, and return its URL."""
-        if not 1 <= number <= PERSONS:
-            raise ConfigError("There is no virtual person {n}. Choose one from 1 to {most}.", n=number, most=PERSONS)
-        return self.choose(f"virtual://?person={number}")
 
     @property
     def simulated(self) -> bool:

@@ -31,6 +31,15 @@ _LOCALE = Path(__file__).parents[1] / "locale"
 # The separator that gettext uses between context and text.
 _CONTEXT = "\x04"
 UNITS: Texts = {"count": "counts"}
+CHANNEL_KINDS: Texts = {
+    "all": "All",
+    "activity": "Activity",
+    "capacitive": "Touch",
+    "proximity": "Proximity",
+    "acceleration": "Acceleration",
+    "angular rate": "Rotation",
+}
+"""Names of the groups of channels."""
 AFFECTS: Texts = {"positive": "positive", "neutral": "neutral", "negative": "negative", "none": "none"}
 
 
@@ -71,15 +80,15 @@ class Words:
         translated = str(self._translation(text) or text.rpartition(_CONTEXT)[2])
         return translated.format(**values) if values else translated
 
+    def each(self, *texts: str) -> list[str]:
+        """Return the translations of several texts, such as the headings of a table."""
+        return [self(text) for text in texts]
+
     def plural(self, one: str, many: str, n: int) -> str:
         """Return the text for a number, which replaces ``{n}``, in the form that the language has for it."""
         forms = self._translation(one)
         form = forms[self._plural_form(n)] if isinstance(forms, tuple) else many if n != 1 else one
         return form.rpartition(_CONTEXT)[2].format(n=n)
-
-    def knows(self, text: str) -> bool:
-        """Return whether there is a translation of an English text."""
-        return bool(self._translation(text))
 
     def _translation(self, text: str) -> str | tuple[str, ...]:
         context, _, text = text.rpartition(_CONTEXT)
@@ -109,6 +118,10 @@ class Words:
     def channel(self, name: str) -> str:
         """Return the name of a sensor channel in this language, or ``name`` itself if it has none."""
         return self(in_context("channel", name))
+
+    def check(self, name: str) -> str:
+        """Return the name of a quality check in this language."""
+        return self(in_context("check", name.replace("-", " ")))
 
     def sentence(self, message: str | Mapping[str, Any]) -> str:
         """Return a `Message` of the library, or its JSON, in this language.

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
+from plushsense.core.sentences import Message
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.archives import DEVICE_NAME
 from plushsense.dataset.index import change_head
@@ -297,6 +298,12 @@ class Workspace:
             return cached[1]
         except Exception:  # noqa: BLE001, RUF100
             return dataset.name
+
+
+def refusal_of(cause: OSError) -> Message:
+    """Return the sentence about an error of the operating system."""
+    where = f" ('{cause.filename}')" if cause.filename else ""
+    return Message("The computer refused: {why}{where}.", why=cause.strerror or str(cause), where=where)
 
 
 def plain_name(text: str, default: str) -> str:

@@ -14,7 +14,6 @@ import jinja2
 from markupsafe import Markup
 from nicegui import context, run, ui
 from nicegui.element import Element
-from nicegui.events import GenericEventArguments
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import plain_label
@@ -26,6 +25,7 @@ from plushsense.studio.app.shell import (
     button,
     html,
     icon_button,
+    message_row,
     named,
     on_change,
     on_page,
@@ -44,6 +44,7 @@ KINDS_OF_TRAINING: Texts = {
 }
 """Names of the jobs of the train page."""
 
+JOB_STATES: Texts = {"running": "running", "done": "done", "refused": "failed", "stopped": "stopped"}
 _CSS = Path(__file__).with_name("elements.css")
 _RECENT_S = 900.0
 _TITLES = {
@@ -105,6 +106,20 @@ def on_enter(field: Element, call: Callable[[], Any]) -> None:
     field.on("keydown.enter", call, js_handler=f'() => {{ window.addEventListener("keyup", {drop}); emit(); }}')
 
 
+@contextmanager
+def open_dialog(label: str, name: str, classes: str = "") -> Iterator[ui.dialog]:
+    """Open a dialog with the elements that are added in the block; it is deleted when it is closed.
+
+    It has no transition, because the next key press may be a command of the page again.
+    """
+    with context.client.content, ui.dialog() as dialog:
+        named(dialog.props("transition-duration=0"), label)
+        with tag(ui.card().classes(classes), name):
+            yield dialog
+    dialog.on("hide", dialog.delete)
+    dialog.open()
+
+
 def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: str = "", value: str = "") -> None:
     """Ask a question in a dialog; if the button with the text ``go`` is clicked, call ``answer``, which may be async.
 
@@ -118,18 +133,14 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
         await on_page(answer)(str(field.value or "").strip() if field is not None else "")
 
     field: ui.input | None = None
-    with context.client.content, ui.dialog() as dialog:
-        named(dialog.props("transition-duration=0"), title)
-        with tag(ui.card(), "ask"):
-            ui.label(title).classes("text-lg text-bold ps-break")
-            if label:
-                field = tag(ui.input(label, value=value).props("autofocus").classes("w-full"), "ask-text")
-                on_enter(field, done)
-            with ui.row().classes("w-full justify-end"):
-                button("", words("Cancel"), dialog.close, "flat" if label else "flat autofocus")
-                button("ask-go", go, done, "unelevated" if label else "outline")
-    dialog.on("hide", dialog.delete)
-    dialog.open()
+    with open_dialog(title, "ask") as dialog:
+        ui.label(title).classes("text-lg text-bold ps-break")
+        if label:
+            field = tag(ui.input(label, value=value).props("autofocus").classes("w-full"), "ask-text")
+            on_enter(field, done)
+        with ui.row().classes("w-full justify-end"):
+            button("", words("Cancel"), dialog.close, "flat" if label else "flat autofocus")
+            button("ask-go", go, done, "unelevated" if label else "outline")
 
 
 async def change_files(
@@ -172,6 +183,22 @@ def summary(text: str) -> ui.html:
     """Add the heading of a collapsible part of the page, which stays visible when the part is folded."""
     style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"
     return html(text, "summary").style(style)
+
+
+MAX_LINES = 40
+"""Most lines of a list of notes that a page shows."""
+
+
+def folded_lines(words: Words, title: str, lines: Sequence[str], name: str = "") -> None:
+    """Add a folded list of lines, if there are any; no more than `MAX_LINES` of them are shown."""
+    if not lines:
+        return
+    with tag(ui.element("details").classes("w-full"), name):
+        summary(title)
+        for line in lines[:MAX_LINES]:
+            ui.label(line).classes("ps-break ps-note")
+        if len(lines) > MAX_LINES:
+            ui.label(words("and {n} more", n=len(lines) - MAX_LINES)).classes("ps-dim")
 
 
 def verdict(good: bool | None, word: str) -> Markup:
@@ -253,7 +280,7 @@ _VENDOR = Path(__file__).parent / "vendor" / "uplot"
 
 
 class Plot(Element, component="plot.js"):
-    """Plot of curves over x with one y-axis and vertical marks, drawn by uPlot.
+    """Plot of curves over x with one y-axis, drawn by uPlot.
 
     Args:
         label: name for screen readers.
@@ -262,9 +289,6 @@ class Plot(Element, component="plot.js"):
         x, y: titles of the axes, with units.
         height: height in pixels; the width is that of the surrounding element.
         window_s: length of the visible part of a live plot in seconds, see `push`.
-        range_y: limits of the y-axis, or None to fit the data.
-        values_y: whether the y-axis displays values.
-        on_pick: called on every click with x, "left" or "right", and whether shift is held.
     """
 
     def __init__(
@@ -276,49 +300,30 @@ class Plot(Element, component="plot.js"):
         y: str = "",
         height: int = 240,
         window_s: float = 0.0,
-        range_y: tuple[float, float] | None = None,
-        values_y: bool = True,
-        on_pick: Callable[[float, str, bool], Any] | None = None,
     ) -> None:
         super().__init__()
         self.add_resource(_VENDOR)
         self._props.update(label=label, series=[dict(s) for s in series], xTitle=x, yTitle=y, height=height)
-        self._props.update(windowS=window_s, rangeY=list(range_y) if range_y else None, valuesY=values_y)
-        self._props.update(pickable=on_pick is not None, start=None)
+        self._props.update(windowS=window_s, start=None)
         self.classes("w-full")
-        if on_pick is not None:
 
-            def picked(event: GenericEventArguments) -> Any:
-                return on_pick(float(event.args["x"]), str(event.args["button"]), bool(event.args["shift"]))
-
-            self.on("pick", picked)
-
-    def begin(
-        self, x: Sequence[float], curves: Sequence[Sequence[float | None]], marks: Sequence[dict[str, Any]] = ()
-    ) -> Plot:
+    def begin(self, x: Sequence[float], curves: Sequence[Sequence[float | None]]) -> Plot:
         """Set the curves to display when the page opens; call this while building the page."""
-        self._props["start"] = {"data": [list(x), *map(list, curves)], "marks": list(marks)}
+        self._props["start"] = [list(x), *map(list, curves)]
         return self
 
     def show(
         self,
         x: Sequence[float],
         curves: Sequence[Sequence[float | None]],
-        marks: Sequence[dict[str, Any]] | None = None,
         series: Sequence[dict[str, Any]] | None = None,
     ) -> None:
-        """Replace all curves and, if given, the marks and the series; None in a curve is a gap."""
-        self.run_method("show", [list(x), *map(list, curves)], marks, series)
+        """Replace all curves and, if given, the series; None in a curve is a gap."""
+        self.run_method("show", [list(x), *map(list, curves)], series)
 
     def push(self, x: Sequence[float], curves: Sequence[Sequence[float]]) -> None:
         """Append samples at the right end of a live plot, and drop those that leave its window."""
         self.run_method("push", list(x), [list(c) for c in curves])
-
-    def lines(self, marks: Sequence[dict[str, Any]]) -> None:
-        """Replace the vertical lines; each has ``x``, ``label``, ``stroke``, and optionally ``dash`` (such as [6, 4]),
-        ``to`` (end of a shaded range) and ``row`` (vertical position of the label).
-        """
-        self.run_method("setMarks", list(marks))
 
 
 # Pictures ---------------------------------------------------------------------------------------------------------
@@ -454,16 +459,9 @@ class WorkPanel:
                     self._bars[job.id] = (bar, tag(where, "where"))
             if last is not None:
                 bad = last.state == REFUSED
-                message = (
-                    words.failure(last.refusal)
-                    if bad
-                    else words("Stopped: {title}. Finished parts are kept.", title=title_of(words, last))
-                )
-                row = ui.row().classes(
-                    f"ps-message ps-message-{'error' if bad else 'warning'} w-full items-center no-wrap"
-                )
-                with tag(row.props(f'role="{"alert" if bad else "status"}"'), "ended"):
-                    ui.label(message).classes("flex-grow").style("overflow-wrap: anywhere")
+                stopped = words("Stopped: {title}. Finished parts are kept.", title=title_of(words, last))
+                with tag(message_row("error" if bad else "warning"), "ended"):
+                    ui.label(words.failure(last.refusal) if bad else stopped).classes("flex-grow ps-break")
                     look = "flat round dense color=inherit"
                     icon_button("close", words("Close this message"), lambda: self._close(last.id), look)
 

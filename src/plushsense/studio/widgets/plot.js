@@ -1,4 +1,4 @@
-// uPlot as a Vue component: `show` sets fixed data, `push` appends live samples, and clicks are emitted as `pick`.
+// uPlot as a Vue component: `show` sets fixed data, and `push` appends live samples.
 import { loadResource } from "../../static/utils/resources.js";
 
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim() || "#555";
@@ -7,15 +7,14 @@ export default {
   template: '<div role="img" :aria-label="label"><div ref="place"></div></div>',
   props: {
     label: String, series: Array, xTitle: String, yTitle: String, height: Number, windowS: Number,
-    rangeY: Array, valuesY: { type: Boolean, default: true }, pickable: Boolean, start: Object, resourcePath: String,
+    start: Array, resourcePath: String,
   },
   async mounted() {
     await this.$nextTick();
     const at = window.path_prefix + this.resourcePath;
     await Promise.all([loadResource(`${at}/uPlot.min.css`), loadResource(`${at}/uPlot.iife.min.js`)]);
     this.curves = this.series;
-    this.kept = this.start ? this.start.data : [[], ...this.series.map(() => [])];
-    this.marks = this.start ? this.start.marks : [];
+    this.kept = this.start || [[], ...this.series.map(() => [])];
     this.build();
     this.resizer = new ResizeObserver(() => {
       const width = this.$el.clientWidth;
@@ -52,56 +51,13 @@ export default {
         height: this.height,
         legend: { live: false },
         cursor: { drag: { x: false, y: false } },
-        scales: { x: { time: false }, y: this.rangeY ? { range: this.rangeY } : {} },
-        axes: [axis(this.xTitle, 44), this.valuesY ? axis(this.yTitle, 64) : { show: false }],
+        scales: { x: { time: false } },
+        axes: [axis(this.xTitle, 44), axis(this.yTitle, 64)],
         series: [{ label: this.xTitle || "x" },
           ...this.curves.map((s, i) => ({ width: 1.5, points: { show: false }, ...s,
             points: { show: s.points === true }, ...(off && off[i + 1] === false ? { show: false } : {}) }))],
-        hooks: { draw: [(u) => this.drawMarks(u)] },
       };
       this.u = new uPlot(options, this.kept, this.$refs.place);
-      if (this.pickable) {
-        const over = this.u.over;
-        over.style.cursor = "crosshair";
-        const pick = (event, button) => {
-          event.preventDefault();
-          const x = this.u.posToVal(event.clientX - over.getBoundingClientRect().left, "x");
-          this.$emit("pick", { x, button, shift: event.shiftKey });
-        };
-        over.addEventListener("click", (event) => pick(event, "left"));
-        over.addEventListener("contextmenu", (event) => pick(event, "right"));
-      }
-    },
-    drawMarks(u) {
-      const { ctx } = u, { left, top, width, height } = u.bbox;
-      ctx.save();
-      ctx.textAlign = "left";
-      ctx.textBaseline = "alphabetic";
-      ctx.beginPath();
-      ctx.rect(left, top, width, height);
-      ctx.clip();
-      for (const m of this.marks) {
-        const x = u.valToPos(m.x, "x", true);
-        if (m.to !== undefined && m.to !== null) {
-          ctx.globalAlpha = 0.15;
-          ctx.fillStyle = m.stroke;
-          ctx.fillRect(x, top, u.valToPos(m.to, "x", true) - x, height);
-          ctx.globalAlpha = 1;
-        }
-        ctx.strokeStyle = ctx.fillStyle = m.stroke || "#D55E00";
-        ctx.lineWidth = 2 * devicePixelRatio;
-        ctx.setLineDash((m.dash || []).map((v) => v * devicePixelRatio));
-        ctx.beginPath();
-        ctx.moveTo(x, top);
-        ctx.lineTo(x, top + height);
-        ctx.stroke();
-        if (m.label) {
-          ctx.font = `${13 * devicePixelRatio}px sans-serif`;
-          const wide = ctx.measureText(m.label).width, pad = 4 * devicePixelRatio;
-          ctx.fillText(m.label, x + pad + wide > left + width ? x - pad - wide : x + pad, top + (14 + 16 * (m.row || 0)) * devicePixelRatio);
-        }
-      }
-      ctx.restore();
     },
     ready(call) {
       // A method may be called before the library is loaded.
@@ -109,21 +65,15 @@ export default {
       (this.late = this.late || []).push(call);
       return false;
     },
-    show(data, marks, series) {
-      if (!this.ready(() => this.show(data, marks, series))) return;
+    show(data, series) {
+      if (!this.ready(() => this.show(data, series))) return;
       this.kept = data;
-      if (marks) this.marks = marks;
       if (series) {
         this.curves = series;
         this.build();
       } else {
         this.u.setData(data);
       }
-    },
-    setMarks(marks) {
-      if (!this.ready(() => this.setMarks(marks))) return;
-      this.marks = marks;
-      this.u.redraw(false);
     },
     push(x, curves) {
       if (!this.ready(() => this.push(x, curves))) return;
@@ -140,7 +90,7 @@ export default {
       const low = this.windowS > 0 ? from : xs[0];
       this.u.batch(() => {
         this.u.setScale("x", { min: low, max: xs[xs.length - 1] });
-        if (!this.rangeY) this.scaleY();
+        this.scaleY();
       });
     },
     scaleY() {

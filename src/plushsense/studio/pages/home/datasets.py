@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from nicegui import context, run, ui
+from nicegui import run, ui
 
 from plushsense.dataset.privacy.forget import people_of_dataset
 from plushsense.studio.app.guard import download_address
@@ -23,7 +23,7 @@ from plushsense.studio.pages.home.sections import (
     simulation_badge,
     titled_card,
 )
-from plushsense.studio.widgets.elements import on_enter, summary
+from plushsense.studio.widgets.elements import on_enter, open_dialog, size, summary
 from plushsense.workflow.datasets import Forgotten, forget
 
 _MAX_PATHS = 5
@@ -68,27 +68,19 @@ class DatasetSection:
             facts = [
                 words("people: {n}", n=entry.people),
                 words("recordings: {n}", n=entry.recordings) + excluded,
-                _size(page, entry.bytes),
+                size(entry.bytes, words),
                 entry.layout,
             ]
             ui.label(" · ".join(facts)).classes("ps-dim")
             checks = [j for j in self._jobs.all("check") if j.spec.get("dataset") == str(entry.path)]
             last = next((j for j in checks if j.state == DONE and j.result.get("dataset") == str(entry.path)), None)
-            ui.label(
-                findings_text(page, last.result)
-                if last is not None
-                else words(in_context("data set", "Not checked yet."))
-            )
+            unchecked = words(in_context("data set", "Not checked yet."))
+            ui.label(unchecked if last is None else findings_text(page, last.result))
             with ui.row().classes("items-center ps-small-gap"):
                 page_links(page, ("review", "train", "publish"), entry.name, dataset=entry.path)
                 if not any(j.state == RUNNING for j in checks):
-                    button(
-                        "check",
-                        words(in_context("button", "Check")),
-                        lambda: self._check(entry),
-                        SMALL,
-                        about=entry.name,
-                    )
+                    text = words(in_context("button", "Check"))
+                    button("check", text, lambda: self._check(entry), SMALL, about=entry.name)
 
     def _check(self, entry: DatasetEntry) -> None:
         with self._page.show_errors():
@@ -112,18 +104,13 @@ class DatasetSection:
             summary(words("Backups: {n}", n=len(backups)))
             for path in backups:
                 with ui.row().classes("ps-row items-center w-full ps-small-gap"):
-                    ui.label(f"{path.stem} · {_size(self._page, path.stat().st_size)}").classes("flex-grow ps-break")
+                    ui.label(f"{path.stem} · {size(path.stat().st_size, words)}").classes("flex-grow ps-break")
                     link = ui.link(words("Download"), download_address(BACKUPS, path.stem)).classes("ps-link")
                     named(link.props("download"), f"{words('Download')}: {path.stem}")
                     restore = on_page(lambda path=path: self._restore(path))
                     button("", words("Restore"), restore, SMALL, about=path.stem)
-                    button(
-                        "",
-                        words("Discard"),
-                        on_page(lambda path=path: self._discard(path)),
-                        SMALL,
-                        about=path.stem,
-                    )
+                    discard = on_page(lambda path=path: self._discard(path))
+                    button("", words("Discard"), discard, SMALL, about=path.stem)
 
     def _restore(self, path: Path) -> None:
         """Start to restore a backup as a new data set; the present one is not changed."""
@@ -134,15 +121,9 @@ class DatasetSection:
             self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))
 
     async def _discard(self, path: Path) -> None:
-        workspace, message = (
-            self._page.workspace,
-            self._page.words("“{name}” is discarded. It can be restored on the home page.", name=path.stem),
-        )
+        workspace = self._page.workspace
+        message = self._page.words("“{name}” is discarded. It can be restored on the home page.", name=path.stem)
         await self._actions.change(lambda: workspace.discard(path), message, workspace.restore)
-
-
-def _size(page: Page, count: float) -> str:
-    return f"{page.words.number(count / 1e6, 1)} MB" if count < 1e9 else f"{page.words.number(count / 1e9, 2)} GB"
 
 
 class ForgetDialog:
@@ -159,20 +140,15 @@ class ForgetDialog:
             self._jobs.check_unused(self._entry.path)
             people = await run.io_bound(people_of_dataset, self._entry.path) or []
             title = words("Removing a person from “{name}”", name=self._entry.name)
-            with context.client.content, ui.dialog() as dialog:
-                named(dialog.props("transition-duration=0"), title)
-                with tag(ui.card().classes("ps-dialog"), "forget"):
-                    heading(title, 2)
-                    choice = ui.select(
-                        people, label=words("Code of the person"), on_change=lambda e: self._preview(e.value)
-                    )
-                    tag(choice.classes("w-full"), "forget-person")
-                    self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
-                    with ui.row().classes("w-full justify-end"):
-                        button("", words("Cancel"), dialog.close, "flat")
-            self._dialog = dialog
-            dialog.on("hide", dialog.delete)
-            dialog.open()
+            with open_dialog(title, "forget", "ps-dialog") as self._dialog:
+                heading(title, 2)
+                choice = ui.select(
+                    people, label=words("Code of the person"), on_change=lambda e: self._preview(e.value)
+                )
+                tag(choice.classes("w-full"), "forget-person")
+                self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
+                with ui.row().classes("w-full justify-end"):
+                    button("", words("Cancel"), self._dialog.close, "flat")
 
     async def _preview(self, person: str) -> None:
         """Show what would be removed and what would be left."""
@@ -188,14 +164,14 @@ class ForgetDialog:
             return
         plan = found.plan
         with self._box:
-            counts = {"files": len(plan.files), "raw": plan.raw, "marks": plan.marks}
-            ui.label(
-                words(
-                    "This is removed and cannot be restored: {files} files, of which {raw} are recordings or "
-                    "streams; {marks} marks.",
-                    **counts,
-                )
-            ).classes("text-bold")
+            text = words(
+                "This is removed and cannot be restored: {files} files, of which {raw} are recordings or streams; "
+                "{marks} marks.",
+                files=len(plan.files),
+                raw=plan.raw,
+                marks=plan.marks,
+            )
+            ui.label(text).classes("text-bold")
             self._paths(plan.files)
             if derived := [*plan.caches, *plan.evaluations, *plan.leftovers]:
                 ui.label(words("Everything that may be derived from the person is removed, too:"))
@@ -212,12 +188,11 @@ class ForgetDialog:
             ]
             ui.label(words("This remains. Look through it and delete it yourself:")).classes("text-bold")
             self._paths(dict.fromkeys(rest))
-            ui.label(
-                words(
-                    "The studio cannot reach copies elsewhere: memory cards, other computers, toys, published data, "
-                    "keys of pseudonyms."
-                )
-            ).classes("ps-note")
+            text = words(
+                "The studio cannot reach copies elsewhere: memory cards, other computers, toys, published data, keys "
+                "of pseudonyms."
+            )
+            ui.label(text).classes("ps-note")
             button("forget-next", words("Go on"), self._confirm, "outline color=negative")
 
     @staticmethod
@@ -244,12 +219,11 @@ class ForgetDialog:
                 self._jobs.start("forget", spec, words("Removing a person from “{name}”", name=self._entry.name))
 
         with self._box:
-            ui.label(
-                words(
-                    "{person} will be removed from this data set for good. Type the code once more.",
-                    person=self._person,
-                )
-            ).classes("text-bold ps-break")
+            person = self._person
+            text = words(
+                "{person} will be removed from this data set for good. Type the code once more.", person=person
+            )
+            ui.label(text).classes("text-bold ps-break")
             code = tag(ui.input(words("Code of the person")).props("autofocus").classes("w-full"), "forget-code")
             on_enter(code, on_page(remove))
             button("forget-go", words("Remove for good"), on_page(remove), "unelevated color=negative")

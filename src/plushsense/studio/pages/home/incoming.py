@@ -32,17 +32,7 @@ from plushsense.studio.app.shell import Page, button, heading, on_change, on_pag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace, plain_name
 from plushsense.studio.pages.home.sections import simulation_badge, titled_card
-from plushsense.studio.widgets.elements import errors_beside, facts, notice, summary
-
-_CHOOSE: Texts = {
-    "choose_files": "Choose files",
-    "choose_folder": "Choose a folder",
-}
-
-_FOLDS: Texts = {
-    "preview_gestures": "Gestures: {n}",
-    "rejected": "Files that are not imported: {n}",
-}
+from plushsense.studio.widgets.elements import MAX_LINES, errors_beside, facts, folded_lines, notice
 
 _LAYOUTS: Texts = {
     "plush-15": "plush toy",
@@ -58,7 +48,6 @@ _LIMITS = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
 _ACCEPTED = ".zip,.plush,.csv,.xdf,.xdfz,.parquet"
 # Files that desktops leave in folders; nobody chose them.
 _OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
-_MAX_LINES = 40
 
 
 def _about(file: str, note: Message) -> Message:
@@ -145,8 +134,7 @@ class Incoming:
             stored.rename(place)
             self.bundles.append(name)
         except BundleError:
-            note = Message("this is no network, or a damaged one")
-            self.refused.append(_about(stored.name, note))
+            self.refused.append(_about(stored.name, Message("this is no network, or a damaged one")))
         except ConfigError as refusal:
             self.refused.append(_about(stored.name, refusal.message))
         finally:
@@ -227,10 +215,11 @@ class IncomingSection:
             with UploadArea(self._store, self._finish, texts) as area, ui.column().classes("w-full ps-small-gap"):
                 ui.label(about).classes("ps-dim")
                 with ui.row().classes("ps-small-gap"):
-                    for key, folder in (("choose_files", "false"), ("choose_folder", "true")):
-                        choose = button(key, words(_CHOOSE[key]), icon="folder" if folder == "true" else "upload_file")
-                        # In the browser, since it opens its dialog only as the answer to a click.
-                        choose.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [{folder}])")
+                    files = button("choose_files", words("Choose files"), icon="upload_file")
+                    folder = button("choose_folder", words("Choose a folder"), icon="folder")
+                    # In the browser, since it opens its dialog only as the answer to a click.
+                    files.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [false])")
+                    folder.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [true])")
             self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
         on_change(jobs.changed, self._update)
         context.client.on_delete(self._leave)
@@ -254,21 +243,16 @@ class IncomingSection:
             with page.show_errors():
                 if problem is not None:
                     raise problem
-                page.say(
-                    words(
-                        "The upload was cancelled. Nothing was imported."
-                        if end["cancelled"]
-                        else "The upload broke off. Nothing was imported. Try again."
-                    ),
-                    "warning",
-                )
+                cancelled = words("The upload was cancelled. Nothing was imported.")
+                broken_off = words("The upload broke off. Nothing was imported. Try again.")
+                page.say(cancelled if end["cancelled"] else broken_off, "warning")
             return
         added, incoming.bundles = incoming.bundles, []
         if added:
             page.say(words("The network “{name}” is added.", name="”, “".join(added)), "good")
             await self._refresh()
         if refused:
-            page.say(" ".join(words.sentence(note) for note in refused[:_MAX_LINES]), "error")
+            page.say(" ".join(words.sentence(note) for note in refused[:MAX_LINES]), "error")
         if incoming.sources:
             self._inspect()
 
@@ -342,25 +326,14 @@ class IncomingSection:
         ]
         facts(rows)
         gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
-        self._lines("preview_gestures", gestures)
+        folded_lines(words, words("Gestures: {n}", n=len(gestures)), gestures, "preview_gestures")
         notes = [words.sentence(n) for n in result["notes"] if not _is_of_preview(n)]
-        if result["flagged"]:
-            notes.append(
-                words("Recordings with something to look at: {n}. The page Review shows them.", n=result["flagged"])
-            )
+        if n := result["flagged"]:
+            notes.append(words("Recordings with something to look at: {n}. The page Review shows them.", n=n))
         for note in notes:
             ui.label(note).classes("ps-note ps-break")
-        self._lines("rejected", [f"{r['file']}: {words.sentence(r['reason'])}" for r in result["rejected"]])
-
-    def _lines(self, key: str, lines: list[str]) -> None:
-        if not lines:
-            return
-        with tag(ui.element("details").classes("w-full"), key):
-            summary(self._words(_FOLDS[key], n=len(lines)))
-            for line in lines[:_MAX_LINES]:
-                ui.label(line).classes("ps-break ps-note")
-            if len(lines) > _MAX_LINES:
-                ui.label(self._words("and {n} more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
+        rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result["rejected"]]
+        folded_lines(words, words("Files that are not imported: {n}", n=len(rejected)), rejected, "rejected")
 
     def _settings(self, current: str, unknown_person: bool, unknown_layout: bool) -> None:
         """Add the fields of what the files do not state: the layout, and the person where it is not known."""
@@ -387,10 +360,8 @@ class IncomingSection:
             layout.error = words("It is not clear which sensors these files are from. Choose them.")
         if unknown_person or self._person:
             with ui.row().classes("items-start ps-small-gap w-full"):
-                person = tag(
-                    ui.input(words("Code of the person (such as S01)"), value=self._person).classes("ps-wide"),
-                    "person-of-files",
-                )
+                person = ui.input(words("Code of the person (such as S01)"), value=self._person).classes("ps-wide")
+                tag(person, "person-of-files")
                 person.on("keydown.enter", on_page(change_person))
                 button("person-use", words("Use this code"), on_page(change_person))
             if unknown_person:
@@ -400,19 +371,16 @@ class IncomingSection:
         words, workspace = self._words, self._page.workspace
         plain = plain_name(result["name"] or self._incoming.name, words("recordings"))
         free = workspace.free_name(DATASETS, plain, separator=" ")
-        name = tag(
-            ui.input(words("Name of the new data set"), value=free).props("maxlength=64").classes("w-full"),
-            "incoming-name",
-        )
+        name = ui.input(words("Name of the new data set"), value=free).props("maxlength=64")
+        tag(name.classes("w-full"), "incoming-name")
 
         async def keep() -> None:
             with errors_beside(self._page, name):
                 place = await run.io_bound(self._incoming.keep, str(name.value or ""))
                 if place is not None:
                     self._reset()
-                    self._page.say(
-                        words("The data set “{name}” is there. Review its recordings next.", name=place.name), "good"
-                    )
+                    there = words("The data set “{name}” is there. Review its recordings next.", name=place.name)
+                    self._page.say(there, "good")
                     await self._refresh()
 
         with ui.row().classes("ps-small-gap"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,16 @@ from plushsense.studio.app.shell import Page, address, button, html, moment, nam
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BACKUPS, DATASETS, DISCARDED
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
-from plushsense.studio.widgets.elements import ask, change_files, errors_beside, item_menu, summary, title_of
+from plushsense.studio.widgets.elements import (
+    JOB_STATES,
+    ask,
+    change_files,
+    errors_beside,
+    folded_lines,
+    item_menu,
+    summary,
+    title_of,
+)
 
 _KINDS: Texts = {
     "recordings": "Session",
@@ -29,24 +38,6 @@ _STATES: Texts = {
     "active": "being recorded now",
     "finished": "finished",
     "unfinished": "not finished",
-}
-
-_JOB_STATES: Texts = {
-    "running": "running",
-    "done": "done",
-    "refused": "failed",
-    "stopped": "stopped",
-}
-
-_ACTIONS: Texts = {
-    "stop": "Stop",
-    "again": "Start again",
-    "drop": "Remove from the list",
-}
-
-_FOLDS: Texts = {
-    "warnings": "Warnings: {n}",
-    "rejected": "Files that are not imported: {n}",
 }
 
 SMALL = 'outline padding="4px 12px"'
@@ -68,7 +59,6 @@ PAGE_OF = {
 """Maps each task to the page that displays its result."""
 _SIGNS = {RUNNING: "▶", DONE: "✓", REFUSED: "✕", STOPPED: "■"}
 _MAX_EARLIER = 6
-_MAX_LINES = 40
 
 
 def titled_card(page: Page, title: str, name: str) -> ui.card:
@@ -132,13 +122,13 @@ class DiscardedSection:
             summary(page.words("Discarded"))
             self._rows = ui.column().classes("w-full ps-small-gap")
 
-    def fill(self, paths: Sequence[Path]) -> None:
+    def fill(self, contents: WorkspaceSummary) -> None:
         """Replace the displayed files."""
         words, workspace = self._page.words, self._page.workspace
         self._rows.clear()
-        self._box.set_visibility(bool(paths))
+        self._box.set_visibility(bool(contents.discarded))
         with self._rows:
-            for path in paths:
+            for path in contents.discarded:
                 kind, _, name = path.relative_to(workspace.folder / DISCARDED).as_posix().partition("/")
                 self._row(path, f"{words(_KINDS[kind])}: {name}", name)
 
@@ -152,12 +142,8 @@ class DiscardedSection:
             await change(lambda: workspace.delete(path), words("“{name}” is deleted.", name=name))
 
         def ask_delete() -> None:
-            ask(
-                words,
-                words("Delete “{name}” for good? This cannot be undone.", name=name),
-                words("Delete for good"),
-                delete,
-            )
+            title = words("Delete “{name}” for good? This cannot be undone.", name=name)
+            ask(words, title, words("Delete for good"), delete)
 
         with ui.row().classes("ps-row items-center w-full ps-small-gap"):
             ui.label(text).classes("flex-grow ps-break")
@@ -307,7 +293,7 @@ class JobList:
             bar = ui.linear_progress(0.0, show_value=False, size="10px").props("rounded")
             self._progress_bars[job.id] = (label, named(bar, title))
         else:
-            ui.label(f"{words(_JOB_STATES[job.state])} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
+            ui.label(f"{words(JOB_STATES[job.state])} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
         if job.state == REFUSED:
             ui.label(words.failure(job.refusal)).classes("ps-bad ps-break")
         if job.state == DONE:
@@ -316,18 +302,18 @@ class JobList:
             if job.state == DONE and job.task in PAGE_OF:
                 page_links(self._page, (PAGE_OF[job.task],), title, dataset=job.result.get("dataset") or "")
             if job.state == RUNNING:
-                self._button("stop", job, lambda: self._jobs.stop(job.id))
+                self._button("stop", words("Stop"), title, lambda: self._jobs.stop(job.id))
                 return
             if job.state == STOPPED:
-                self._button("again", job, lambda: self._jobs.resume(job.id))
-            self._button("drop", job, lambda: self._jobs.drop(job.id))
+                self._button("again", words("Start again"), title, lambda: self._jobs.resume(job.id))
+            self._button("drop", words("Remove from the list"), title, lambda: self._jobs.drop(job.id))
 
-    def _button(self, key: str, job: StudioJob, action: Callable[[], object]) -> None:
+    def _button(self, key: str, label: str, title: str, action: Callable[[], object]) -> None:
         def clicked() -> None:
             with self._page.show_errors():
                 action()
 
-        button(f"job-{key}", self._page.words(_ACTIONS[key]), clicked, SMALL, about=title_of(self._page.words, job))
+        button(f"job-{key}", label, clicked, SMALL, about=title)
 
     def _progress(self, job: StudioJob) -> tuple[str, float | None]:
         """Return the progress as text, and as a fraction from 0 to 1 (None if unknown)."""
@@ -350,9 +336,10 @@ class JobList:
             link = ui.link(words("Download"), download_address(BACKUPS, place.stem)).classes("ps-link")
             tag(link.props("download"), "download")
         if job.task == "forget":
-            ui.label(
-                words("The person is removed, with {n} files. Delete what remains elsewhere, too.", n=result["files"])
+            removed = words(
+                "The person is removed, with {n} files. Delete what remains elsewhere, too.", n=result["files"]
             )
+            ui.label(removed)
         if job.task in ("import", "simulate", "restore"):
             people = result.get("subjects", result.get("people", 0))
             facts = [words("recordings: {n}", n=result["recordings"]), words("people: {n}", n=people)]
@@ -360,15 +347,8 @@ class JobList:
                 facts.append(words("new: {n}", n=result["added"]["recordings"]))
             ui.label(" · ".join(facts))
         warnings = [words.sentence(w) for w in (*job.warnings, *result.get("warnings", ()))]
-        if result.get("flagged"):
-            warnings.append(
-                words("Recordings with something to look at: {n}. The page Review shows them.", n=result["flagged"])
-            )
+        if n := result.get("flagged"):
+            warnings.append(words("Recordings with something to look at: {n}. The page Review shows them.", n=n))
         rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result.get("rejected", ())]
-        for key, lines in (("warnings", warnings), ("rejected", rejected)):
-            if lines:
-                with ui.expansion(words(_FOLDS[key], n=len(lines))).classes("w-full").props("dense"):
-                    for line in lines[:_MAX_LINES]:
-                        ui.label(line).classes("ps-break ps-note")
-                    if len(lines) > _MAX_LINES:
-                        ui.label(words("and {n} more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
+        folded_lines(words, words("Warnings: {n}", n=len(warnings)), warnings)
+        folded_lines(words, words("Files that are not imported: {n}", n=len(rejected)), rejected)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from nicegui import ui
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.sentences import Message
-from plushsense.studio.app.shell import Page, button, on_change, on_page, tag
-from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, with_layout
+from plushsense.devices.opening import check_address, parse_url
+from plushsense.studio.app.shell import Kind, Page, button, message_row, on_change, on_page, tag
+from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, described, with_layout
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.home.sections import SMALL, simulation_badge, titled_card
 from plushsense.studio.widgets.elements import errors_beside
@@ -41,10 +41,8 @@ class ToySection:
                 button("virtual", text, lambda: self._choose(f"virtual://?person={who.value}"), "unelevated")
             self._others = ui.column().classes("w-full ps-small-gap")
             with ui.row().classes("items-start ps-small-gap w-full"):
-                field = ui.input(words("Address of another toy"), placeholder="tcp://192.168.1.20:3333").classes(
-                    "ps-wide"
-                )
-                self._address = tag(field, "address")
+                field = ui.input(words("Address of another toy"), placeholder="tcp://192.168.1.20:3333")
+                self._address = tag(field.classes("ps-wide"), "address")
                 field.on("keydown.enter", self._use)
                 button("use", words("Use this toy"), self._use)
         self._update()
@@ -57,7 +55,7 @@ class ToySection:
         """Choose the toy at the address that was typed; an error is shown beside the field."""
         with errors_beside(self._page, self._address):
             url = str(self._address.value or "").strip()
-            self._toys.check(url)
+            check_address(parse_url(url))
             self._toys.choose(url)
             self._try_out()
 
@@ -89,8 +87,7 @@ class ToySection:
                     simulation_badge(self._page)
             if trial is not None:
                 kind, text = self._describe(trial)
-                box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap")
-                with tag(box.props('role="status"'), "trial"):
+                with tag(message_row(kind), "trial"):
                     if trial.running:
                         ui.spinner(size="1.2em", color="inherit").props("aria-hidden=true")
                     ui.label(text).classes("ps-break")
@@ -99,11 +96,10 @@ class ToySection:
                     fitting, url = trial.layout, with_layout(trial.url, trial.layout)
                     text = words("Use the sensors of {layout}", layout=fitting)
                     button("use-layout", text, on_page(lambda: self._choose(url)), "unelevated")
-                button("test", words("Test the toy"), on_page(self._try_out)).set_enabled(
-                    trial is None or not trial.running
-                )
+                test = button("test", words("Test the toy"), on_page(self._try_out))
+                test.set_enabled(trial is None or not trial.running)
 
-    def _describe(self, trial: ToyTrial) -> tuple[str, str]:
+    def _describe(self, trial: ToyTrial) -> tuple[Kind, str]:
         """Return the kind of message and the sentence about a trial."""
         words, result = self._words, trial.result
         if trial.running:
@@ -126,8 +122,7 @@ class ToySection:
         self._others.clear()
         given = [(url, "", words("given when the studio was started")) for url in self._page.workspace.devices]
         found = [d for d in toys.listing.devices if d.kind != "virtual"]
-        # The description of a serial port is that of the system.
-        listed = [(d.url, d.name, words.sentence(a) if isinstance(a := d.description, Message) else a) for d in found]
+        listed = [(d.url, d.name, described(words, d)) for d in found]
         with self._others:
             for url, name, about in [*given, *listed]:
                 with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):
@@ -145,9 +140,8 @@ class ToySection:
             for note in toys.listing.notes:
                 ui.label(words.sentence(note)).classes("ps-dim ps-note ps-break")
             button("look", words("Look again" if toys.searched else "Look for toys"), toys.search, SMALL)
-            ui.label(
-                words(
-                    "Only serial ports are searched when this page opens. The button also searches by Bluetooth, and "
-                    "asks the network for LSL streams."
-                )
-            ).classes("ps-dim ps-note")
+            about = words(
+                "Only serial ports are searched when this page opens. The button also searches by Bluetooth, and asks "
+                "the network for LSL streams."
+            )
+            ui.label(about).classes("ps-dim ps-note")

@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import threading
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from plushsense.core.errors import ConfigError
+from nicegui import ui
+
+from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
 from plushsense.core.recorder_csv import parse_name
 from plushsense.experiments.adaptation import adapt
 from plushsense.live.adaptation import Personal
 from plushsense.models.bundle import Bundle
 from plushsense.recording.session import check_subject
+from plushsense.studio.app.shell import Page, button, named, on_change, tag
+from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BUNDLES, ChangeSignal, Workspace, plain_name
 from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.validation import Validation
+
+_OUTCOMES: Texts = {
+    "gain": "Of {n} own recordings, each left out once, it reads {after} right instead of {before}.",
+    "no_gain": (
+        "The recordings would not clearly help: of {n}, each left out once, {after} instead of {before} would be "
+        "read right."
+    ),
+    "inseparable": (
+        "The recordings cannot be told apart (of {n}, {after} are read right): perhaps their gestures or the sensors "
+        "are wrong."
+    ),
+}
+
 
 _SUFFIX = ".plush"
 
@@ -66,7 +87,9 @@ class Adapting:
             done = adapt(bundle, self._workspace.inside(recordings), subject=subject)
             if not done.accepted:
                 return Improved("", choice.bundle, done.personal)
-            out = self._save(done.bundle, choice.bundle.stem, subject)
+            base = plain_name(choice.bundle.stem.partition(f"-for-{subject}")[0], "network")[:40]
+            name = self._workspace.free_name(BUNDLES, f"{base}-for-{subject}", _SUFFIX)
+            out = done.bundle.save(self._workspace.new(BUNDLES, name + _SUFFIX))
             self._reader.choose(out, choice.engine, choice.reactions)
         self.changed.notify()
         return Improved(out.stem, choice.bundle, done.personal)
@@ -76,7 +99,116 @@ class Adapting:
         choice = self._reader.choice
         self._reader.choose(result.before, choice.engine, choice.reactions)
 
-    def _save(self, bundle: Bundle, stem: str, subject: str) -> Path:
-        base = stem.partition(f"-for-{subject}")[0]
-        name = f"{plain_name(base, 'network')[:40]}-for-{subject}"
-        return bundle.save(self._workspace.new(BUNDLES, self._workspace.free_name(BUNDLES, name, _SUFFIX) + _SUFFIX))
+
+def show(page: Page, people: PersonFields) -> None:
+    """Build the part, which is beside the current event."""
+    box = ui.element("div").props("role=group").classes("w-full column no-wrap ps-small-gap q-mt-sm")
+    with named(box, page.words("Adapt the network to a person")):
+        _AdaptingPanel(page, people)
+
+
+class PersonFields:
+    """The fields of a page for the code of the person who touches the toy; all of them hold the same text."""
+
+    def __init__(self, page: Page, reader: LiveReader) -> None:
+        self._page, self._reader = page, reader
+        self._fields: list[ui.input] = []
+        self.code = reader.subject
+
+    def add(self, name: str, on_change: Callable[[], None] = lambda: None) -> ui.input:
+        """Add a field; ``on_change`` is called when the text of any field has changed."""
+        field = ui.input(self._page.words("Code of the person"), value=self.code, placeholder="S01")
+        tag(field.props("maxlength=16"), name)
+        self._fields.append(field)
+
+        def changed() -> None:
+            self.code = str(field.value or "").strip()
+            field.error = None
+            for other in self._fields:
+                other.set_value(field.value)
+            self._reader.subject = ""
+            # A code that is still being typed may be invalid.
+            with contextlib.suppress(BadInput):
+                self._reader.subject = check_subject(self.code)
+            on_change()
+
+        field.on_value_change(changed)
+        return field
+
+    def checked(self, field: ui.input) -> str:
+        """Return the code; if it is missing or invalid, say so beside ``field`` and return ""."""
+        text = ""
+        try:
+            text = check_subject(self.code)
+        except BadInput as refusal:
+            missing = self._page.words(
+                "First enter the code of the person who touches the toy, for example S01 and never a name."
+            )
+            field.error = self._page.words.error(refusal) if self.code else missing
+            field.run_method("focus")
+        return text
+
+
+class _AdaptingPanel:
+    """Fields and buttons that adapt the network in use to recordings of a person, and take the former one back."""
+
+    def __init__(self, page: Page, people: PersonFields) -> None:
+        self._words, self._people = page.words, people
+        self._adapting = page.workspace.part(Adapting)
+        self._busy = False
+        words = page.words
+        ui.label(words("Adapt the network to a person")).classes("text-bold")
+        with ui.row().classes("w-full items-center ps-small-gap"):
+            self._person = people.add("adapt-person", self._update).style("flex: 1 1 9rem")
+            self._recordings = tag(ui.select({}, label=words("Recordings of the person")), "adapt-from")
+            self._recordings.style("flex: 1 1 15rem; min-width: 0")
+            self._adapt = button("adapt", words("Adapt to these recordings"), self._run, icon="auto_fix_high")
+        # Messages are displayed here, because the top of the page may be out of view.
+        self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
+        on_change(self._adapting.changed, self._update)
+        on_change(page.workspace.part(Validation).changed, self._update)
+        self._update()
+
+    async def _run(self) -> None:
+        """Adapt the network, and say what changed, with a button to undo it."""
+        if self._busy or not (subject := self._people.checked(self._person)):
+            return
+        words, recordings = self._words, Path(str(self._recordings.value or ""))
+        self._busy = True
+        self._page.say(words("The network is being improved…"))
+        self._update()
+        try:
+            with self._page.show_errors():
+                done = await asyncio.to_thread(self._adapting.adapt, subject, recordings)
+                own = done.personal
+                scores = {"n": own.before.recordings, "before": own.before.right, "after": own.after.right}
+                outcome = words(_OUTCOMES[own.refusal or "gain"], **scores)
+                if done.name:
+                    names = {"name": done.name, "before": done.before.stem, "subject": subject}
+                    message = words(
+                        "Now in use for {subject}: {name}. The former network, {before}, is unchanged.", **names
+                    )
+                    self._page.say(f"{message} {outcome}", "good", lambda: self._take_back(done))
+                else:
+                    self._page.say(f"{words('The network stays as it is.')} {outcome}", "warning")
+        finally:
+            self._busy = False
+            self._update()
+
+    async def _take_back(self, done: Improved) -> None:
+        with self._page.show_errors():
+            await asyncio.to_thread(self._adapting.take_back, done)
+            self._page.say(self._words("The network {name} is in use again.", name=done.before.stem), "good")
+
+    def _update(self) -> None:
+        subject = self._people.code
+        sources: list[Path] = []
+        if subject:
+            # A code that is still being typed may be invalid.
+            with contextlib.suppress(PlushSenseError, OSError):
+                sources = self._adapting.sources(subject)
+        everything = self._words("all recordings of {subject}", subject=subject)
+        options = {str(p): p.name if p.name != subject else everything for p in sources}
+        if options != self._recordings.options:
+            self._recordings.set_options(options, value=next(iter(options), None))
+        self._adapt.set_enabled(bool(options) and not self._busy)

@@ -18,8 +18,8 @@ from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.guard import is_loopback
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, on_change
 from plushsense.studio.app.words import Texts, Words
+from plushsense.studio.pages.live.live_state import UNREAD, EventSpan, LiveState, Situation
 from plushsense.studio.pages.live.reader import LiveReader
-from plushsense.studio.pages.live.state import UNREAD, EventSpan, LiveState, Performed, Situation
 
 VIEW_TEXTS: Texts = {
     "signals": "Signals",
@@ -229,7 +229,11 @@ class Feed:
             message["spans"] = [_span(s) for s in self._reader.spans(self._change)]
             self._change = now.changes
         if now.performed > self._performed:
-            message["did"] = [_performed(p) for p in self._reader.performed(self._performed)]
+            made = enumerate(self._reader.performed(self._performed), self._performed + 1)
+            message["did"] = [
+                {"id": number, "from": round(p.start_s, 2), "to": round(p.end_s, 2), "label": p.label}
+                for number, p in made
+            ]
             self._performed = now.performed
         # These values change rarely, so they are sent only after a change.
         situation = _situation(now.situation)
@@ -250,15 +254,6 @@ class Feed:
 def _situation(situation: Situation) -> FeedMessage:
     sure = None if situation.confidence is None else round(100.0 * situation.confidence)
     return {**vars(situation), "confidence": sure}
-
-
-def _performed(performed: Performed) -> FeedMessage:
-    return {
-        "id": performed.number,
-        "from": round(performed.begin_s, 2),
-        "to": round(performed.end_s, 2),
-        "label": performed.label,
-    }
 
 
 def _span(span: EventSpan) -> FeedMessage:

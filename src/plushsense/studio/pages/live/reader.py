@@ -25,7 +25,7 @@ from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-from plushsense.studio.pages.live.state import Connection, EventSpan, LiveChoice, LiveState, Performed, quiet_reason
+from plushsense.studio.pages.live.live_state import Connection, EventSpan, LiveChoice, LiveState, quiet_reason
 
 KEPT_SPANS = 200
 KEPT_SPAN_S = 600.0
@@ -72,7 +72,7 @@ class LiveReader:
         self._events: dict[int, EventSpan] = {}
         self._begun = self._changes = 0
         self._first = 1
-        self._performed: list[Performed] = []
+        self._performed: list[PerformedGesture] = []
         self._started = 0.0
         self.subject = ""
         self._next: _BundleRun | None = None
@@ -92,9 +92,7 @@ class LiveReader:
             ConfigError, DeviceError, BundleError: if the toy or bundle cannot be opened, or they do not fit each other.
         """
         with self._changing:
-            if choice.bundle is None:
-                raise _no_bundle()
-            bundle = _load(self._workspace.inside(choice.bundle))
+            bundle = _load(self._workspace, choice.bundle)
             classifier = _classifier(bundle, choice.engine)
             reactor = _reactor(choice.reactions, bundle)
             url = with_speed(choice.toy, self._workspace.speed)
@@ -113,13 +111,8 @@ class LiveReader:
                 self._first, self._performed, self._malformed = self._begun + 1, [], 0
                 self._started = time.time()
                 self.device, self.bundle, self._next = device, bundle, bundle_run
-                self.now = LiveState(
-                    self.now.generation + 1,
-                    running=True,
-                    connection="connecting",
-                    state="warming",
-                    changes=self._changes,
-                )
+                fresh = LiveState(self.now.generation + 1, True, connection="connecting", state="warming")
+                self.now = replace(fresh, changes=self._changes)
             self._ends = threading.Event()
             self._thread = threading.Thread(
                 target=self._read, args=(device, self._ends), name="plushsense-live", daemon=True
@@ -141,11 +134,9 @@ class LiveReader:
                 self.choice = replace(self.choice, bundle=bundle, engine=engine, reactions=reactions)
                 self.changed.notify()
                 return
-            if bundle is None:
-                raise _no_bundle()
             fresh = before
             if bundle != self.choice.bundle:
-                fresh = _load(self._workspace.inside(bundle))
+                fresh = _load(self._workspace, bundle)
                 _refuse_strange(fresh, before)
             reactor = _reactor(reactions, fresh)
             bundle_run = _BundleRun(fresh, run_on(device, _classifier(fresh, engine), warn=_kept), reactor)
@@ -185,7 +176,8 @@ class LiveReader:
             person.follow()
             if label:
                 person.perform(label)
-        self._set(next_gesture=label or "")
+        with self._lock:
+            self.now = replace(self.now, next_gesture=label or "")
         self.changed.notify()
 
     def close(self) -> None:
@@ -246,8 +238,8 @@ class LiveReader:
         with self._lock:
             return list(self._events.values())
 
-    def performed(self, since: int = 0) -> list[Performed]:
-        """Return the gestures that the virtual person has made since the toy was opened, those after ``since``."""
+    def performed(self, since: int = 0) -> list[PerformedGesture]:
+        """Return the gestures that the virtual person has made since the toy was opened, but the first ``since``."""
         with self._lock:
             return self._performed[since:]
 
@@ -279,16 +271,8 @@ class LiveReader:
         with self._lock:
             if self.device is device:
                 self._end_event(self.now.t_s)
-                self.now = replace(
-                    self.now,
-                    running=False,
-                    ended=None if ends.is_set() else ended,
-                    connection="",
-                    state="",
-                    probabilities=None,
-                    reaction=None,
-                    next_gesture="",
-                )
+                still = replace(self.now, running=False, ended=None if ends.is_set() else ended, next_gesture="")
+                self.now = replace(still, connection="", state="", probabilities=None, reaction=None)
         self.changed.notify()
 
     def _poll(self, device: TappedDevice, bundle_run: _BundleRun) -> None:
@@ -415,38 +399,27 @@ class LiveReader:
     def _add_performed(self, device: VirtualDevice, made: PerformedGesture) -> None:
         """Note a gesture that the virtual person begins; called in the reader thread."""
         with self._lock:
-            number = len(self._performed) + 1
-            self._performed.append(Performed(number, made.label, made.start_s, made.end_s))
-            self.now = replace(self.now, performed=number, next_gesture=device.prompted)
+            self._performed.append(made)
+            self.now = replace(self.now, performed=len(self._performed), next_gesture=device.prompted)
 
     def _performed_in(self, begin_s: float, end_s: float) -> str | None:
         """Return the gesture of the virtual person that an event reports, "" for none, None for any other toy."""
         if self.device is None or _virtual(self.device) is None:
             return None
         overlaps = {
-            min(end_s, made.end_s + _LATE_S) - max(begin_s, made.begin_s - _EARLY_S): made.label
+            min(end_s, made.end_s + _LATE_S) - max(begin_s, made.start_s - _EARLY_S): made.label
             for made in self._performed[-20:]
         }
         longest = max(overlaps, default=0.0)
         return overlaps[longest] if longest > 0.0 else ""
-
-    def _set(self, **changed: Any) -> None:
-        with self._lock:
-            self.now = replace(self.now, **changed)
 
     def _swap(self, fresh: _BundleRun) -> None:
         """Continue with another bundle, and end the current event."""
         with self._lock:
             self._end_event(self.now.t_s)
             self.bundle = fresh.bundle
-            self.now = replace(
-                self.now,
-                generation=self.now.generation + 1,
-                state="warming",
-                answer=None,
-                probabilities=None,
-                reaction=None,
-            )
+            self.now = replace(self.now, state="warming", answer=None, probabilities=None, reaction=None)
+            self.now = replace(self.now, generation=self.now.generation + 1)
         self.changed.notify()
 
     def _end_event(self, t_s: float) -> None:
@@ -458,10 +431,6 @@ class LiveReader:
 
 def _kept(_: str) -> None:
     """Leave a warning to `LiveRun.warnings`, which the pages show."""
-
-
-def _no_bundle() -> ConfigError:
-    return ConfigError("No network is chosen. Choose one, or train one first.", field="network")
 
 
 def _virtual(device: TappedDevice) -> VirtualDevice | None:
@@ -481,10 +450,12 @@ def _simulated(url: str) -> bool:
     return head.simulated if head is not None else is_simulation(place, [])
 
 
-def _load(path: Path) -> Bundle:
+def _load(workspace: Workspace, path: Path | None) -> Bundle:
     """Read a bundle; an error has a message of the studio's own."""
+    if path is None:
+        raise ConfigError("No network is chosen. Choose one, or train one first.", field="network")
     try:
-        return Bundle.load(path)
+        return Bundle.load(workspace.inside(path))
     except BundleError as cause:
         raise BundleError(
             "The network {name} cannot be read: the file is missing or damaged, or another version wrote it. Choose "

@@ -232,14 +232,8 @@ def _close_event(receiver: FrameReceiver) -> SessionEvent:
 
 def _protocol(bundle: Bundle) -> Protocol:
     labels = bundle.gestures.labels
-    return Protocol(
-        name="live",
-        title="Live validation",
-        gesture_set=bundle.gestures.name,
-        gestures=labels,
-        prompts={label: label for label in labels},
-        repetitions=1,
-    )
+    prompts = {label: label for label in labels}
+    return Protocol("live", "Live validation", bundle.gestures.name, labels, prompts, 1)
 
 
 def _count_losses(take: RecordingTake, layout: Layout) -> None:

@@ -27,7 +27,6 @@ from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
-from plushsense.studio.pages.live.state import Performed
 from plushsense.windows.clock import row_times_us
 
 FOLDER = "validations"
@@ -225,20 +224,20 @@ class Validation:
                     return
                 self._next(run, now_s, device_ms)
                 return
-            start_s, stop_s = made.begin_s, made.end_s
+            start_s, stop_s = made
         if now_s >= stop_s:
             label, repetition = run.plan[self.status.at]
             run.trials.append(GestureTrial(label, repetition, start_s, start_s, stop_s))
             run.until_s = now_s + AFTER_S
             self.status = replace(self.status, phase="after", left_s=0, done=len(run.trials))
 
-    def _made(self, run: _Run, now_s: float) -> Performed | None:
-        """Return the prompted gesture if the virtual person has begun it, with times in the recording."""
+    def _made(self, run: _Run, now_s: float) -> tuple[float, float] | None:
+        """Return when in the recording the virtual person makes the prompted gesture; None if it has not begun."""
         made = [p for p in self._reader.performed(run.performed) if p.label == self.status.label]
         if not made:
             return None
         shift_s = now_s - float(run.device.buffer.since(run.device.buffer.count - 1).seconds[-1])
-        return replace(made[-1], begin_s=made[-1].begin_s + shift_s, end_s=made[-1].end_s + shift_s)
+        return made[-1].start_s + shift_s, made[-1].end_s + shift_s
 
     def _next(self, run: _Run, now_s: float, device_ms: int | None) -> None:
         if self.status.at + 1 < len(run.plan):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -14,9 +13,9 @@ from nicegui import ui
 
 from plushsense.experiments.protocol.run import PAGE, TABLE, TRIALS
 from plushsense.experiments.protocol.score import NAMELESS
-from plushsense.studio.app.shell import Page, button, html, on_change, section, tag
+from plushsense.studio.app.shell import Page, button, html, moment, on_change, section, tag
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.live.adapting_page import PersonFields
+from plushsense.studio.pages.live.adapting import PersonFields
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.validation import FOLDER, Validation
 from plushsense.studio.widgets.elements import notice, picture, scroll_to, summary, table
@@ -52,19 +51,6 @@ _NOTES: Texts = {
     ),
 }
 
-_REACTIONS: Texts = {
-    "positive": "The toy is pleased now",
-    "negative": "The toy is cross now",
-}
-
-_SAVE: Texts = {
-    "report": "Save the report (in English)",
-    "table": "Save the table (CSV)",
-    "trials": "Save every trial (CSV)",
-}
-
-_FILES = {"report": PAGE, "table": TABLE, "trials": TRIALS}
-
 
 def show(page: Page, reader: LiveReader, people: PersonFields) -> None:
     """Build the section, whose content is folded until it is needed."""
@@ -81,14 +67,13 @@ class _ValidationPanel:
         self._validation = page.workspace.part(Validation)
         self._workspace = page.workspace
         words = page.words
-        ui.label(
-            words(
-                "The paper's protocol (section 4.6): the person makes every gesture as prompted, each several times "
-                "in a row. The page measures how long the rules and the network need for a right answer, and how "
-                "sure the network is. Choose a person on whom the network was not trained. The signals are recorded "
-                "as a session of that person."
-            )
-        ).classes("ps-dim")
+        about = words(
+            "The paper's protocol (section 4.6): the person makes every gesture as prompted, each several times in a "
+            "row. The page measures how long the rules and the network need for a right answer, and how sure the "
+            "network is. Choose a person on whom the network was not trained. The signals are recorded as a session of "
+            "that person."
+        )
+        ui.label(about).classes("ps-dim")
         # Messages are displayed here, because the top of the page may be out of view.
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         self._form = ui.row().classes("w-full items-start ps-small-gap")
@@ -102,12 +87,23 @@ class _ValidationPanel:
             first = next(iter(datasets), "")
             self._rules = ui.select(rules, value=first, label=words("Tune the old rules on")).classes("w-64")
             tag(self._rules, "validation-rules")
-            self._noted = tag(
-                ui.checkbox(words("The toy has rules of its own: note its reactions")), "validation-noted"
-            )
-            self._begin = button(
-                "validate", words("Begin the validation"), self._start, "unelevated", icon="play_arrow"
-            )
+            noted = ui.checkbox(words("The toy has rules of its own: note its reactions"))
+            self._noted = tag(noted, "validation-noted")
+            begin = words("Begin the validation")
+            self._begin = button("validate", begin, self._start, "unelevated", icon="play_arrow")
+        self._add_prompts()
+        with tag(ui.element("details").classes("w-full"), "validation-results") as self._past:
+            summary(words("Results"))
+            self._results = tag(ui.select({}, label=words("Result")).classes("w-64 q-mt-sm"), "validation-result")
+            self._result = tag(ui.column().classes("w-full ps-small-gap"), "validation-table")
+        self._results.on_value_change(self._show_result)
+        self._drawn: tuple[Any, ...] = ()
+        on_change(self._validation.changed, self._update)
+        on_change(reader.changed, self._update_button)
+        self._update()
+
+    def _add_prompts(self) -> None:
+        words = self._words
         self._prompts = tag(ui.column().classes("w-full ps-card ps-next ps-small-gap"), "validation-prompts")
         with self._prompts:
             with ui.row().classes("w-full items-center no-wrap"):
@@ -127,19 +123,10 @@ class _ValidationPanel:
                 button("validation-stop", words("End and score"), self._validation.stop, icon="stop")
             self._reactions = ui.row().classes("w-full items-center ps-small-gap")
             with self._reactions:
-                for affect, text in _REACTIONS.items():
-                    react = partial(self._validation.react, affect)
-                    button(f"validation-{affect}", words(text), react, "outline")
+                texts = words.each("The toy is pleased now", "The toy is cross now")
+                for affect, text in zip(("positive", "negative"), texts, strict=True):
+                    button(f"validation-{affect}", text, partial(self._validation.react, affect))
                 self._noted_count = tag(ui.label("").classes("ps-dim"), "validation-noted-count")
-        with tag(ui.element("details").classes("w-full"), "validation-results") as self._past:
-            summary(words("Results"))
-            self._results = tag(ui.select({}, label=words("Result")).classes("w-64 q-mt-sm"), "validation-result")
-            self._result = tag(ui.column().classes("w-full ps-small-gap"), "validation-table")
-        self._results.on_value_change(self._show_result)
-        self._drawn: tuple[Any, ...] = ()
-        on_change(self._validation.changed, self._update)
-        on_change(reader.changed, self._update_button)
-        self._update()
 
     async def _start(self) -> None:
         if not (subject := self._people.checked(self._person)):
@@ -184,20 +171,13 @@ class _ValidationPanel:
             self._update_results(str(status.result or ""))
             if last and status.result is not None:
                 self._past.props("open")
-                self._page.say(
-                    words(
-                        "The validation has ended. Trials: {n}. Everything is in the folder {folder}.",
-                        n=status.done,
-                        folder=f"{FOLDER}/{status.result.name}",
-                    ),
-                    "good",
-                )
+                values = {"n": status.done, "folder": f"{FOLDER}/{status.result.name}"}
+                ended = words("The validation has ended. Trials: {n}. Everything is in the folder {folder}.", **values)
+                self._page.say(ended, "good")
 
     def _update_results(self, chosen: str) -> None:
         found = self._validation.results()
-        when = {
-            str(p): f"{p.name}, {time.strftime('%Y-%m-%d %H:%M', time.localtime(p.stat().st_mtime))}" for p in found
-        }
+        when = {str(p): f"{p.name}, {moment(p.stat().st_mtime)}" for p in found}
         self._past.set_visibility(bool(found))
         self._results.set_options(when, value=chosen or next(iter(when), None))
 
@@ -211,14 +191,17 @@ class _ValidationPanel:
             with self._result:
                 _result_table(self._words, result)
                 with ui.row().classes("ps-small-gap"):
-                    for key, name in _FILES.items():
-                        save = self._workspace.inside(folder / name)
-                        button(
-                            f"validation-{key}",
-                            self._words(_SAVE[key]),
-                            lambda save=save: ui.download.content(save.read_bytes(), f"{save.parent.name}-{save.name}"),
-                            icon="download",
-                        )
+                    self._save("report", self._words("Save the report (in English)"), folder / PAGE)
+                    self._save("table", self._words("Save the table (CSV)"), folder / TABLE)
+                    self._save("trials", self._words("Save every trial (CSV)"), folder / TRIALS)
+
+    def _save(self, name: str, label: str, file: Path) -> None:
+        path = self._workspace.inside(file)
+
+        def download() -> None:
+            ui.download.content(path.read_bytes(), f"{path.parent.name}-{path.name}")
+
+        button(f"validation-{name}", label, download, icon="download")
 
 
 def _result_table(words: Words, result: Mapping[str, Any]) -> None:
@@ -252,9 +235,5 @@ def _result_table(words: Words, result: Mapping[str, Any]) -> None:
     if result["simulated"]:
         notice(words("Simulation: these data say nothing about a real toy.")).style("box-sizing: border-box")
     ui.label(words(_NOTES[network])).classes("ps-dim ps-note")
-    table(
-        words("People: {people}. Times are medians of the answered trials.", people=", ".join(result["people"])),
-        head,
-        rows,
-        range(1, len(head)),
-    )
+    caption = words("People: {people}. Times are medians of the answered trials.", people=", ".join(result["people"]))
+    table(caption, head, rows, range(1, len(head)))

@@ -28,21 +28,6 @@ from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import PACKAGES, Workspace
 from plushsense.studio.widgets.elements import WorkPanel, link, notice, size, table, text, verdict
 
-_HEADS: Texts = {
-    "package": "Package",
-    "what": "Title",
-    "data": "Data",
-    "made": in_context("package", "Created"),
-    "last_check": "Last check",
-    "validator": "Validator",
-    "answer": "Result",
-    "looks_at": "What it checks",
-    "file": "File or folder",
-    "problem": "Problem, in the words of the validator",
-    "files_count": "Files",
-    "size": "Size",
-}
-
 _VALIDATORS: Texts = {
     "checksums": "Every file is there and unchanged, and there is no other file.",
     "data": "The recordings can be read, the tables agree with them, and nothing private is left.",
@@ -98,11 +83,7 @@ class DatasetFacts:
             dataset = open_dataset(path)
         except PlushSenseError as refusal:
             return cls(path, problem=refusal)
-        return cls(
-            path,
-            dataset,
-            own_codes=tuple(s for s in dataset.subjects if not is_drawn(s)),
-        )
+        return cls(path, dataset, own_codes=tuple(s for s in dataset.subjects if not is_drawn(s)))
 
 
 @dataclass(frozen=True)
@@ -243,7 +224,7 @@ class PackagesSection:
             if not rows:
                 text(words("There are no packages yet."), classes="ps-dim")
                 return
-            head = [words(_HEADS[k]) for k in ("package", "what", "data", "made", "last_check")]
+            head = words.each("Package", "Title", "Data", in_context("package", "Created"), "Last check")
             table(words("Packages of this studio, the newest first"), head, rows)
 
     def _state(self, job: StudioJob | None) -> Markup:
@@ -275,15 +256,12 @@ class PackagesSection:
                         text(sentence)
                 self._contents(package)
 
-    def _size(self, count: int) -> str:
-        return size(count, self.words)
-
     def _take(self, package: PackageFacts) -> None:
         words = self.words
         with tag(ui.column().classes("ps-card ps-next w-full"), "take"):
             text(words(in_context("heading", "Download")), "h3")
             if package.zip is not None:
-                message = words("Download the zip ({size})", size=self._size(package.zip.stat().st_size))
+                message = words("Download the zip ({size})", size=size(package.zip.stat().st_size, words))
                 download = ui.link(message, download_address(PACKAGES, package.name)).classes("ps-link")
                 tag(download.props("download"), "download")
             else:
@@ -300,14 +278,9 @@ class PackagesSection:
             else:
                 with ui.row().classes("items-center"):
                     html(self._state(job))
-                    text(
-                        words(
-                            "All validators accept it."
-                            if job.result["valid"]
-                            else "Do not publish it like this: some validators reject it."
-                        ),
-                        "span",
-                    )
+                    good = words("All validators accept it.")
+                    bad = words("Do not publish it like this: some validators reject it.")
+                    text(good if job.result["valid"] else bad, "span")
                 self._validators(job.result)
                 for each in job.result.get("sentences", ()):
                     notice(words.sentence(each), "info")
@@ -322,11 +295,10 @@ class PackagesSection:
             about = words(_VALIDATORS[name]) if name in VALIDATORS else ""
             mark = verdict(good, words("passed") if good else words("problems: {n}", n=each["problems"]))
             rows.append((name, mark, about))
-        head = [words(_HEADS[k]) for k in ("validator", "answer", "looks_at")]
-        tag(table(words("Validators"), head, rows), "validators")
+        tag(table(words("Validators"), words.each("Validator", "Result", "What it checks"), rows), "validators")
         if problems := result["problems"]:
             listed = [(p["validator"], p["file"] or words("package"), p["problem"]) for p in problems[:_MAX_PROBLEMS]]
-            head = [words(_HEADS[k]) for k in ("validator", "file", "problem")]
+            head = words.each("Validator", "File or folder", "Problem, in the words of the validator")
             tag(table(words("Problems: {n}", n=len(problems)), head, listed), "problems")
             if len(problems) > _MAX_PROBLEMS:
                 text(words("… and {n} more.", n=len(problems) - _MAX_PROBLEMS), classes="ps-dim")
@@ -340,19 +312,17 @@ class PackagesSection:
         words = self.words
         with tag(ui.column().classes("ps-card w-full"), "contents"):
             text(words("Contents"), "h3")
-            rows = [(name, str(files), self._size(total)) for name, (files, total) in package.contents.items()]
+            rows = [(name, str(files), size(total, words)) for name, (files, total) in package.contents.items()]
             files, total = (sum(each) for each in zip(*package.contents.values(), strict=True)) if rows else (0, 0)
-            with ui.expansion(words("Files: {n}, {size}", n=files, size=self._size(total))).classes("w-full"):
-                head = [words(_HEADS[k]) for k in ("file", "files_count", "size")]
+            with ui.expansion(words("Files: {n}, {size}", n=files, size=size(total, words))).classes("w-full"):
+                head = words.each("File or folder", "Files", "Size")
                 table(words("Contents of the package"), head, rows, (1, 2))
             if package.citation:
                 text(words("How to cite it"), "h3")
                 tag(text(package.citation), "citation")
                 if "doi.org" not in package.citation:
-                    text(
-                        words("There is no DOI yet. Reserve one at a repository, then publish again with it."),
-                        classes="ps-dim",
-                    )
+                    advice = words("There is no DOI yet. Reserve one at a repository, then publish again with it.")
+                    text(advice, classes="ps-dim")
 
 
 def newest_validation(jobs: Jobs, package: PackageFacts) -> StudioJob | None:

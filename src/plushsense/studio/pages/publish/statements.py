@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +19,6 @@ from plushsense.dataset.store import DatasetHead
 from plushsense.studio.app.shell import Page, button, focus, heading, icon_button, tag
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.widgets.elements import text
-
-_FIELDS: Texts = {
-    "creator_name": "Family name, first name",
-    "creator_orcid": "ORCID iD (optional)",
-    "creator_affiliation": "Institution (optional)",
-}
 
 _ABOUT: Texts = {
     "title": "What others find and cite, such as “Touch on a plush companion”.",
@@ -80,16 +74,12 @@ class _CreatorRow:
         self._words = words
         with ui.row().classes("w-full items-start no-wrap ps-small-gap") as self.box:
             with ui.row().classes("col items-start ps-small-gap"):
-                self.name = self._field("creator_name", creator.name if creator else "")
-                self.orcid = self._field("creator_orcid", creator.orcid if creator else "")
-                self.affiliation = self._field("creator_affiliation", creator.affiliation if creator else "")
+                self.name = _field("name", words("Family name, first name"), creator.name if creator else "")
+                self.orcid = _field("orcid", words("ORCID iD (optional)"), creator.orcid if creator else "")
+                where = creator.affiliation if creator else ""
+                self.affiliation = _field("affiliation", words("Institution (optional)"), where)
             remove = icon_button("delete", words("Remove this author"), lambda: removed(self))
             tag(remove, "creator-remove")
-
-    def _field(self, key: str, value: str) -> ui.input:
-        field = ui.input(self._words(_FIELDS[key]), value=value).classes("ps-wide")
-        watched(tag(field, key.replace("_", "-")))
-        return field
 
     def creator(self) -> Creator | None:
         """Return the person; None if the row is empty or invalid, which the row then shows."""
@@ -97,6 +87,21 @@ class _CreatorRow:
         with beside(self._words, self.name if not name else self.orcid):
             return Creator(name, orcid.rpartition("/")[2], where) if name or orcid or where else None
         return None
+
+
+def _field(name: str, label: str, value: str) -> ui.input:
+    field = tag(ui.input(label, value=value).classes("ps-wide"), f"creator-{name}")
+    watched(field)
+    return field
+
+
+def ask_again(page: Page, fields: Iterable[Field]) -> bool:
+    """Move the focus to the first of ``fields`` with an error; return whether there is one."""
+    wrong = next((field for field in fields if field.error), None)
+    if wrong is not None:
+        focus(wrong)
+        page.say(page.words("Not yet: see what is missing beside the fields in red."), "error")
+    return wrong is not None
 
 
 class StatementsForm:
@@ -183,7 +188,7 @@ class StatementsForm:
             contact = Contact((self._name.value or "").strip(), (self._mail.value or "").strip())
         title, description = (self._title.value or "").strip(), (self._description.value or "").strip()
         consent = (self._consent.value or "").strip()
-        if self._ask_for_first_error():
+        if ask_again(self._page, self._fields):
             return False
 
         def change(head: DatasetHead) -> DatasetHead:
@@ -197,8 +202,7 @@ class StatementsForm:
         self._show_missing(missing)
         if complete:
             self._mark_missing(missing)
-            return not self._ask_for_first_error()
-        return True
+        return not complete or not ask_again(self._page, self._fields)
 
     def _mark_missing(self, missing: list[str]) -> None:
         places: dict[str, Field] = {
@@ -211,14 +215,6 @@ class StatementsForm:
         }
         for key in missing:
             places[key].error = self._words(_NEEDS[key])
-
-    def _ask_for_first_error(self) -> bool:
-        """Move the focus to the first field with an error; return whether there is one."""
-        wrong = [field for field in self._fields if field.error]
-        if wrong:
-            focus(wrong[0])
-            self._page.say(self._words("Not yet: see what is missing beside the fields in red."), "error")
-        return bool(wrong)
 
     async def _save_part(self) -> None:
         with self._page.show_errors():

@@ -12,7 +12,7 @@ from nicegui.element import Element
 from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import Page, add_style, html, on_change, tag
 from plushsense.studio.app.words import Texts
-from plushsense.studio.pages.record.controller import ActiveSession, RecordController
+from plushsense.studio.pages.record.controller import RecordController
 from plushsense.studio.widgets.elements import own_picture, picture
 
 _STATES: Texts = {
@@ -91,12 +91,9 @@ class _ChildView:
             self._state = tag(ui.label().classes("ps-child-state ps-current").props("role=status"), "child-state")
             ConnectionAlert().prepare(page.words("One moment …"))
 
-    def _session(self) -> ActiveSession | None:
-        return self._controller.get(self._name)
-
     def draw(self) -> None:
         """Show the current step, or a resting picture if the session is not open."""
-        session, words = self._session(), self._page.words
+        session, words = self._controller.get(self._name), self._page.words
         s = session.recorder.status() if session is not None else None
         rests = s is None or s.state in _RESTING
         gesture = "" if s is None or rests else s.step.gesture

@@ -9,10 +9,11 @@ from nicegui import run, ui
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import load_gestures
-from plushsense.devices.opening import is_virtual, list_devices
+from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import ORDERS
 from plushsense.studio.app.shell import Page, button, named, tag
-from plushsense.studio.app.words import Texts, Words
+from plushsense.studio.app.toys import toy_title
+from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.controller import RecordController
 from plushsense.studio.widgets.elements import summary
 
@@ -32,11 +33,6 @@ PROTOCOLS: Texts = {
 _SCAN_S = 3.0
 
 
-def toy_name(words: Words, url: str) -> str:
-    """Return the text for a toy in a list: its URL, marked if the toy is virtual."""
-    return f"{words('Virtual toy (simulation)')} · {url}" if is_virtual(url) else url
-
-
 class ToyChoice:
     """A list of toys, a button that searches for more, and a field for any other address.
 
@@ -48,7 +44,7 @@ class ToyChoice:
     def __init__(self, page: Page, urls: Sequence[str], prefix: str = "") -> None:
         self._page, self._urls, words = page, urls, page.words
         label = words("Toy")
-        self._list = ui.select({u: toy_name(words, u) for u in urls}, value=urls[0], label=label)
+        self._list = ui.select({u: toy_title(words, u) for u in urls}, value=urls[0], label=label)
         named(tag(self._list, f"{prefix}toy"), label).style("width: 27rem; max-width: 100%")
         self._look = button(f"{prefix}look", words("Look for toys"), self._search)
         self._other = ui.input(label=words("Address of another toy")).props(
@@ -81,7 +77,7 @@ class ToyChoice:
             self._look.enable()
         if listing is None:
             return
-        options = {u: toy_name(words, u) for u in dict.fromkeys(self._urls)}
+        options = {u: toy_title(words, u) for u in dict.fromkeys(self._urls)}
         options |= {d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in options}
         self._list.set_options(options, value=self._list.value)
         notes = [words.sentence(note) for note in listing.notes]

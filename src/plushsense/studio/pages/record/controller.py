@@ -238,9 +238,7 @@ class RecordController:
     def close_session(self, name: str) -> None:
         """Close a session and discard only the recording in progress; do nothing if it is closed already."""
         with self._opening:
-            with self._lock:
-                session = self._active.get(name)
-            if session is not None:
+            if (session := self.get(name)) is not None:
                 self._end(session)
 
     def _end(self, session: ActiveSession) -> None:

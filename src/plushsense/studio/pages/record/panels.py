@@ -11,21 +11,11 @@ from nicegui import ui
 
 from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import LINES, Page, button, named, on_click, tag
-from plushsense.studio.app.words import Texts, Words
+from plushsense.studio.app.words import CHANNEL_KINDS, Texts, Words
 from plushsense.studio.pages.record.controller import ActiveSession
 from plushsense.studio.widgets.elements import Plot, summary
 
-_KINDS: Texts = {
-    "capacitive": "Touch",
-    "proximity": "Proximity",
-    "acceleration": "Acceleration",
-}
-
-_STEPS: Texts = {
-    "made": "recorded",
-    "skipped": "skipped",
-    "open": "not recorded yet",
-}
+_STEPS: Texts = {"made": "recorded", "skipped": "skipped", "open": "not recorded yet"}
 
 _SIGNALS: Texts = {
     "good": "Good",
@@ -87,7 +77,7 @@ class SignalPanel:
         plots = []
         with ui.row().classes("w-full items-start").style("gap: 8px"):
             for kind, indices in kinds.items():
-                title = words(_KINDS.get(kind, kind))
+                title = words(CHANNEL_KINDS.get(kind, kind))
                 names = [words.channel(channels[n].name) for n in indices]
                 label = words(
                     "The last {s} seconds of: {channels}", s=f"{_WINDOW_S * speed:g}", channels=", ".join(names)
@@ -122,13 +112,10 @@ class SignalPanel:
         shares = {"recent": percent(s.bad_share, words), "ever": percent(s.bad_share_total, words)}
         # Without a signal, these figures are meaningless.
         has_signal = s.signal not in ("none", "unreadable")
-        self._lost.text = (
-            words(
-                "{recent} % of frames lost or damaged in the last 10 s, {ever} % since the session was opened", **shares
-            )
-            if has_signal
-            else ""
+        lost = words(
+            "{recent} % of frames lost or damaged in the last 10 s, {ever} % since the session was opened", **shares
         )
+        self._lost.text = lost if has_signal else ""
         self._rate.text = words("{rate} frames a second", rate=f"{s.rate_hz:.0f}") if has_signal else ""
         counts = {k: getattr(s, k) for k in ("lost", "malformed", "garbage", "gaps", "reconnects")}
         self._counters.text = words(

@@ -19,7 +19,6 @@ from plushsense.dataset.quality.findings import SEVERITIES
 from plushsense.studio.app.shell import Page, address, button, on_change, set_address, tag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.review.review import (
-    CHECK_NAMES,
     EXCLUDED,
     LABELLED,
     LOOKING,
@@ -96,28 +95,18 @@ class RecordingFilter:
 
     def fits(self, row: ReviewedRecording, word: Callable[[str], str] = str) -> bool:
         """Return whether a recording meets all conditions; ``word`` translates the messages of findings."""
+        severity = {"": True, NO_FINDING: not row.worst}.get(self.severity)
+        if severity is None:
+            severity = bool(row.worst) and SEVERITIES.index(row.worst) <= SEVERITIES.index(self.severity)
+        text = self.text.strip().casefold()
         return (
             self.person in ("", row.info.subject)
             and self.gesture in ("", row.info.gesture)
-            and self._state_fits(row)
-            and self._severity_fits(row)
+            and self.state in ("", row.state, DONE if row.done else TO_DO)
+            and severity
             and (not self.check or any(f.check == self.check for f in row.findings))
-            and self._text_fits(row, word)
+            and any(text in s.casefold() for s in (row.id, *(word(f.message) for f in row.findings if text)))
         )
-
-    def _state_fits(self, row: ReviewedRecording) -> bool:
-        if self.state in (TO_DO, DONE):
-            return row.done == (self.state == DONE)
-        return self.state in ("", row.state)
-
-    def _severity_fits(self, row: ReviewedRecording) -> bool:
-        if self.severity in ("", NO_FINDING):
-            return not self.severity or not row.worst
-        return bool(row.worst) and SEVERITIES.index(row.worst) <= SEVERITIES.index(self.severity)
-
-    def _text_fits(self, row: ReviewedRecording, word: Callable[[str], str]) -> bool:
-        text = self.text.strip().casefold()
-        return any(text in s.casefold() for s in (row.id, *(word(f.message) for f in row.findings if text)))
 
     @classmethod
     def of(cls, query: Mapping[str, str]) -> RecordingFilter:
@@ -222,14 +211,9 @@ class ReviewController:
         if not self._query.get("selection"):
             self._query |= {"title": title}
         if missing := [i for i in only if i not in self.only]:
-            self.page.say(
-                self.words(
-                    "Linked recordings that are not in this data set: {n}, for example “{first}”.",
-                    n=len(missing),
-                    first=missing[0],
-                ),
-                "warning",
-            )
+            values = {"n": len(missing), "first": missing[0]}
+            text = self.words("Linked recordings that are not in this data set: {n}, for example “{first}”.", **values)
+            self.page.say(text, "warning")
 
     # Building -----------------------------------------------------------------------------------------------------
 
@@ -239,12 +223,8 @@ class ReviewController:
         with ui.row().classes("w-full items-center ps-small-gap"):
             tag(ui.label(review.dataset.head.name).classes("text-lg text-bold"), "name")
             if review.dataset.head.simulated:
-                tag(
-                    ui.label(words("Simulation: these data say nothing about a real toy.")).classes(
-                        "ps-message ps-message-warning"
-                    ),
-                    "simulation",
-                )
+                mark = ui.label(words("Simulation: these data say nothing about a real toy."))
+                tag(mark.classes("ps-message ps-message-warning"), "simulation")
             self.counts = tag(ui.label().props("role=status"), "counts")
             self.making = tag(ui.label().classes("ps-dim").props("role=status"), "making")
             ui.space()
@@ -253,15 +233,11 @@ class ReviewController:
             to_train = ui.link(words("Next: train →"), address("train", dataset=review.path)).classes("ps-link")
             tag(to_train, "to-train")
         if review.is_labelled:
-            tag(
-                ui.label(
-                    words(
-                        "These recordings are cut where the label of the rows changes, so they cannot be trimmed. "
-                        "Findings and exclusion work as usual."
-                    )
-                ).classes("ps-message ps-message-info w-full"),
-                "labelled",
+            about = words(
+                "These recordings are cut where the label of the rows changes, so they cannot be trimmed. Findings and "
+                "exclusion work as usual."
             )
+            tag(ui.label(about).classes("ps-message ps-message-info w-full"), "labelled")
         with ui.row().classes("w-full items-center ps-small-gap"):
             shown = [v for v in VIEWS if v != STREAM or self.streams]
             toggle = ui.toggle({v: words(_VIEWS[v]) for v in shown}, value=self.view)
@@ -277,12 +253,9 @@ class ReviewController:
         self._label_fold()
         if self.only is not None:
             with tag(ui.row().classes("w-full items-center ps-message ps-message-info"), "selection"):
-                ui.label(
-                    words("Only the linked recordings ({n}). {title}", n=len(self.only), title=self.title or "")
-                ).classes("flex-grow")
+                text = words("Only the linked recordings ({n}). {title}", n=len(self.only), title=self.title)
+                ui.label(text).classes("flex-grow")
                 ui.link(words("Show all"), address("review", dataset=review.path)).style("color: inherit")
-        # Out of the flow, so that it leaves no gap.
-        self.page_slot = ui.element("div").style("position: absolute")
         self.views = {name: view(self) for name, view in views.items()}
         on_change(review.changed, self.changed)
         ui.timer(_LOOK_S, self._look)
@@ -301,7 +274,7 @@ class ReviewController:
                 **{s: words(_SEVERITIES[s]) for s in SEVERITIES},
                 NO_FINDING: words("no finding"),
             },
-            "check": {c: words(CHECK_NAMES.get(c, c)) for c in CHECKS if "recording" in CHECKS[c].scope},
+            "check": {c: words.check(c) for c in CHECKS if "recording" in CHECKS[c].scope},
         }
         self._fields: dict[str, Any] = {}
         for key, choices in options.items():

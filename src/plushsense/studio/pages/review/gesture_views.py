@@ -9,23 +9,11 @@ from nicegui import ui
 
 from plushsense.dataset.statistics import DurationBand, duration_bands
 from plushsense.studio.app.shell import LINES, address, button, tag
-from plushsense.studio.app.words import Texts, in_context
+from plushsense.studio.app.words import in_context
 from plushsense.studio.pages.review.controller import DURATIONS, ReviewController
-from plushsense.studio.pages.review.plot import ReviewPlot
+from plushsense.studio.pages.review.plot import DrawingSpec, ReviewPlot
 from plushsense.studio.pages.review.signals import GestureOverlay
-from plushsense.studio.pages.review.table_view import check_name
 from plushsense.studio.widgets.elements import link, table
-
-_HEADS: Texts = {
-    "gesture": "Gesture",
-    "n": "Number",
-    "mean": "Mean",
-    "median": "Median",
-    "sd": "Standard deviation",
-    "least": "Shortest",
-    "most": "Longest",
-    "odd": in_context("column", "Outliers"),
-}
 
 _MAX_OUTLIERS = 30
 _GREY = "#8a9099"
@@ -54,12 +42,11 @@ class GestureOverlayView:
                     words("Overlay of the recordings of one gesture"), height=420, legend=False, on_pick=self.picked
                 )
                 tag(self.plot, "overlay-plot")
-                ui.label(
-                    words(
-                        "Click a curve or a name to open the recording. Excluded recordings are left out, and trims "
-                        "are applied."
-                    )
-                ).classes("ps-dim")
+                about = words(
+                    "Click a curve or a name to open the recording. Excluded recordings are left out, and trims are "
+                    "applied."
+                )
+                ui.label(about).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
                 ui.label(words("Outliers")).classes("text-bold")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "outliers")
@@ -102,16 +89,16 @@ class GestureOverlayView:
             "{gesture}: recordings {n}, outliers {odd}.", n=len(overlay.drawn), odd=len(outliers), gesture=gesture
         )
         self.summary.set_text(summary if overlay.drawn else words("There is nothing to draw yet."))
-        self.plot.show(
+        drawing = DrawingSpec(
             f"overlay {self._gesture}",
             summary,
-            np.round(overlay.x, 4).tolist(),
-            curves,
+            [np.round(overlay.x, 4).tolist(), *curves],
             series,
             x_title=words("Seconds since the first row (grey: outside the recording)"),
             y_title=words("Deviation from rest (1 = usual)"),
             limits=(0.0, overlay.top),
         )
+        self.plot.show(drawing)
         self.names.clear()
         with self.names:
             if not outliers:
@@ -120,7 +107,7 @@ class GestureOverlayView:
                 with ui.row().classes("items-center no-wrap w-full"):
                     dash = ui.element("span").classes("ps-dash").style("width: 22px; height: 4px; flex: none")
                     dash.style(f"background: {colours[c.recording]}")
-                    text = f"{c.recording}: {', '.join(check_name(words, check) for check in c.why.split(', '))}"
+                    text = f"{c.recording}: {', '.join(words.check(check) for check in c.why.split(', '))}"
                     name = button("", text, lambda c=c: desk.open(c.recording), "flat dense align=left")
                     name.style("overflow-wrap: anywhere; text-align: left").classes("flex-grow")
             if len(outliers) > _MAX_OUTLIERS:
@@ -161,19 +148,17 @@ class DurationsView:
                     words("Durations of the recordings of one gesture"), height=380, legend=False, on_pick=self.picked
                 )
                 self.plot = tag(plot, "durations-plot")
-                ui.label(
-                    words(
-                        "The line is the mean, the shaded band the durations that differ from it by no more than the "
-                        "percentage. Click a point or a name to open the recording."
-                    )
-                ).classes("ps-dim")
+                about = words(
+                    "The line is the mean, the shaded band the durations that differ from it by no more than the "
+                    "percentage. Click a point or a name to open the recording."
+                )
+                ui.label(about).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
                 ui.label(words("Outliers")).classes("text-bold")
                 select = button("select-outliers", "", self._select, "outline")
                 self.select = select.classes("ps-act")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "duration-outliers")
-        with ui.column().classes("w-full") as self.all:
-            pass
+        self.all = ui.column().classes("w-full")
         self.all.move(self.place)
 
     def draw(self) -> None:
@@ -226,11 +211,10 @@ class DurationsView:
         seconds = [(s, i in outliers) for i, s in band.seconds.items()]
         points = [[s if odd is out else None for s, odd in seconds] for out in (False, True)]
         lines = [[value] * n for value in (band.mean_s, band.low_s, band.high_s)]
-        self.plot.show(
+        drawing = DrawingSpec(
             f"durations {band.gesture}",
             summary,
-            list(range(1, n + 1)),
-            [*points, *lines],
+            [list(range(1, n + 1)), *points, *lines],
             [
                 {"label": "", "stroke": _INSIDE, "dots": True},
                 {"label": "", "stroke": _OUTSIDE, "dots": True},
@@ -242,6 +226,7 @@ class DurationsView:
             limits=(0.0, 1.08 * max(band.high_s, band.statistics.max)),
             bands=[{"series": [5, 4], "fill": "rgba(0,114,178,0.14)"}],
         )
+        self.plot.show(drawing)
 
     def _list(self) -> None:
         words, band = self.desk.words, self._band
@@ -265,21 +250,14 @@ class DurationsView:
         for gesture, band in bands.items():
             to = address("review", dataset=desk.review.path, view=DURATIONS, gesture=gesture)
             numbers = _numbers(desk, band)
-            rows.append(
-                (
-                    link(words.gesture(gesture), to),
-                    str(len(band.seconds)),
-                    *(numbers[key] for key in ("mean", "median", "sd", "least", "most")),
-                    str(len(band.outliers)),
-                )
-            )
-        head = [words(head) for head in _HEADS.values()]
+            gesture_link, count = link(words.gesture(gesture), to), str(len(band.seconds))
+            rows.append((gesture_link, count, *numbers.values(), str(len(band.outliers))))
+        head = words.each("Gesture", "Number", "Mean", "Median", "Standard deviation", "Shortest", "Longest")
+        head.append(words(in_context("column", "Outliers")))
         self.all.clear()
         with self.all:
-            tag(
-                table(words("Durations of all gestures, in seconds"), head, rows, range(1, len(head))),
-                "durations-table",
-            )
+            caption = words("Durations of all gestures, in seconds")
+            tag(table(caption, head, rows, range(1, len(head))), "durations-table")
 
     async def picked(self, event: dict[str, Any]) -> None:
         """Open the recording whose point is nearest to the click."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,39 @@ from nicegui.element import Element
 from plushsense.studio.app.shell import LINES
 
 _VENDOR = Path(__file__).parents[2] / "widgets" / "vendor" / "uplot"
+
+
+@dataclass(frozen=True)
+class DrawingSpec:
+    """Curves to plot.
+
+    Attributes:
+        id: id that is sent back with every click and key.
+        label: text alternative.
+        data: times in seconds, and the values of each curve.
+        series: a dictionary for each curve with label, stroke and options of uPlot; ``dots`` draws points only.
+        x_title, y_title: titles of the axes.
+        lanes: pairs (position, name) that replace the numbers of the y-axis.
+        limits: range of the y-axis.
+        marks: vertical lines with ``x``, ``label``, ``stroke`` and ``dash``.
+        cut: ranges (from, to) to shade because they are trimmed off, or (from, to, CSS colour, name).
+        bands: areas to fill, with ``series`` (the numbers of the upper and lower curve) and ``fill``.
+        keep: whether to keep the zoom if the recording is the same.
+    """
+
+    id: str
+    label: str
+    data: Sequence[Sequence[float | None]]
+    series: Sequence[dict[str, Any]]
+    x_title: str
+    y_title: str = ""
+    lanes: Sequence[tuple[float, str]] = ()
+    limits: tuple[float, float] | None = None
+    marks: Sequence[dict[str, Any]] = ()
+    cut: Sequence[tuple[Any, ...]] = ()
+    bands: Sequence[dict[str, Any]] = ()
+    thinned: bool = False
+    keep: bool = False
 
 
 class ReviewPlot(Element, component="review_plot.js"):
@@ -45,41 +79,9 @@ class ReviewPlot(Element, component="review_plot.js"):
             if handler is not None:
                 self.on(event, lambda e, handler=handler: handler(dict(e.args)))
 
-    def show(
-        self,
-        identity: str,
-        label: str,
-        x: Sequence[float],
-        curves: Sequence[Sequence[float | None]],
-        series: Sequence[dict[str, Any]],
-        *,
-        x_title: str,
-        y_title: str = "",
-        lanes: Sequence[tuple[float, str]] = (),
-        limits: tuple[float, float] | None = None,
-        marks: Sequence[dict[str, Any]] = (),
-        cut: Sequence[tuple[Any, ...]] = (),
-        bands: Sequence[dict[str, Any]] = (),
-        thinned: bool = False,
-        keep: bool = False,
-    ) -> None:
-        """Replace the plotted curves.
-
-        Args:
-            identity: id that is sent back with every click and key.
-            series: a dictionary for each curve with label, stroke and options of uPlot; ``dots`` draws points only.
-            label: text alternative.
-            lanes: pairs (position, name) that replace the numbers of the y-axis.
-            limits: range of the y-axis.
-            marks: vertical lines with ``x``, ``label``, ``stroke`` and ``dash``.
-            cut: ranges (from, to) to shade because they are trimmed off, or (from, to, CSS colour, name).
-            bands: areas to fill, with ``series`` (the numbers of the upper and lower curve) and ``fill``.
-            keep: whether to keep the zoom if the recording is the same.
-        """
-        plot = {"id": identity, "label": label, "data": [x, *curves], "series": series, "from": x[0] if x else 0.0}
-        plot |= {"xTitle": x_title, "y": y_title, "lanes": lanes, "range": limits, "marks": marks, "cut": cut}
-        plot["bands"] = bands
-        self.run_method("show", plot | {"thinned": thinned, "keep": keep})
+    def show(self, drawing: DrawingSpec) -> None:
+        """Replace the plotted curves."""
+        self.run_method("show", vars(drawing))
 
     def remark(
         self, identity: str, marks: Sequence[dict[str, Any]], cut: Sequence[tuple[Any, ...]], label: str

@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 from nicegui import ui
 
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, button, icon_button, named, tag
-from plushsense.studio.app.words import Texts, in_context
+from plushsense.studio.app.words import CHANNEL_KINDS, Texts, in_context
 from plushsense.studio.pages.review.controller import ReviewController
-from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
+from plushsense.studio.pages.review.plot import DrawingSpec, ReviewPlot, curve_styles
 from plushsense.studio.pages.review.review import STATE_TEXTS
-from plushsense.studio.pages.review.signals import ACTIVITY, ALL, KINDS
+from plushsense.studio.pages.review.signals import ACTIVITY, ALL
 from plushsense.studio.pages.review.table_view import (
     SIGNS,
-    advice,
     ask_gesture,
     ask_reason,
     finding_button,
     finding_text,
     recorded_as,
 )
-
-_ZOOM_TEXTS: Texts = {
-    "in": "Zoom in",
-    "out": "Zoom out",
-    "all": "The whole recording",
-}
 
 _MARKS: Texts = {
     "start": "start {at} s",
@@ -38,43 +32,26 @@ _SUGGESTED: Texts = {
     "stop": "suggested end {at} s",
 }
 
-_KEY_TEXTS: Texts = {
-    "accept": "accept and go to the next one",
-    "next": "next recording",
-    "back": "back to the one before",
-    "pass": "next, previous, without a decision",
-    "start": "move the start by a row (or click)",
-    "stop": "move the end (or Shift-click, right click)",
-    "ten": "move by ten rows, with Shift the end",
-    "edges": "start at the first row, end at the last",
-    "drop": "reset the start and the end",
-    "exclude": "exclude, or include again",
-    "undo": "undo the last decision, one by one",
-    "zoom": "zoom in, zoom out, whole recording",
-    "relabel": "set another gesture",
+_KEYS: Texts = {
+    "Enter": "accept and go to the next one",
+    "Backspace": "back to the one before",
+    "↓ ↑": "next, previous, without a decision",
+    "← →": "move the start by a row (or click)",
+    "Shift + ← →": "move the end (or Shift-click, right click)",
+    ", .": "move by ten rows, with Shift the end",
+    "Home, End": "start at the first row, end at the last",
+    "s, Esc": "reset the start and the end",
+    "x": "exclude, or include again",
+    "g": "set another gesture",
+    "u": "undo the last decision, one by one",
+    "+ − 0": "zoom in, zoom out, whole recording",
 }
 
 START, STOP = "start", "stop"
-KEYS = (
-    ("Enter", "accept"),
-    ("Backspace", "back"),
-    ("↓ ↑", "pass"),
-    ("← →", "start"),
-    ("Shift + ← →", "stop"),
-    (", .", "ten"),
-    ("Home, End", "edges"),
-    ("s, Esc", "drop"),
-    ("x", "exclude"),
-    ("g", "relabel"),
-    ("u", "undo"),
-    ("+ − 0", "zoom"),
-)
-"""Keyboard commands: pairs of the keys to press and the key of the text that describes the command."""
-# Commands available for recordings that cannot be trimmed.
-_PLAIN = ("accept", "back", "pass", "exclude", "relabel", "undo", "zoom")
+# Keys that trim.
+_TRIMMING = ("← →", "Shift + ← →", ", .", "Home, End", "s, Esc")
 _SET, _DRAFT = "--ps-set", "--ps-draft"
 _STEPS = {"ArrowLeft": -1, "ArrowRight": 1, ",": -10, "<": -10, ";": -10, ".": 10, ">": 10, ":": 10}
-_ZOOMS = {"zoom_in": ("zoom_in", 0.5), "zoom_out": ("zoom_out", 2.0), "zoom_all": ("fit_screen", 0.0)}
 # Of the window's height.
 _PLOT_HEIGHT = 0.52
 
@@ -113,12 +90,12 @@ class RecordingView:
                 self.findings = tag(ui.column().classes("w-full"), "findings")
                 ui.label(words("Keys")).classes("text-bold q-mt-md")
                 with tag(ui.element("dl").classes("ps-keys q-ma-none"), "keys"):
-                    for key, does in KEYS:
-                        if trims or does in _PLAIN:
+                    for key, does in _KEYS.items():
+                        if trims or key not in _TRIMMING:
                             with ui.element("dt"):
                                 ui.label(key).classes("ps-key").style("display: inline-block")
                             with ui.element("dd"):
-                                ui.label(words(_KEY_TEXTS["next" if does == "accept" and not trims else does]))
+                                ui.label(words("next recording") if key == "Enter" and not trims else words(does))
 
     def _button(self, text: str, action: Any, name: str, look: str = "outline") -> ui.button:
         return button(name, self.desk.words(text), action, look).classes("ps-act")
@@ -161,14 +138,15 @@ class RecordingView:
             toggle = ui.toggle({g: self._kind(g) for g in groups}, value=ALL)
             toggle.props(f'no-caps dense unelevated aria-label="{words("Channels shown")}"').classes("ps-toggle")
             tag(toggle, "group").on_value_change(lambda e: self._grouped(str(e.value)))
-            for key, (icon, factor) in _ZOOMS.items():
-                zoom = icon_button(
-                    icon, words(_ZOOM_TEXTS[key.removeprefix("zoom_")]), lambda factor=factor: self.plot.zoom(factor)
-                )
-                tag(zoom.classes("ps-act"), key)
+            for name, icon, text, factor in (
+                ("zoom_in", "zoom_in", words("Zoom in"), 0.5),
+                ("zoom_out", "zoom_out", words("Zoom out"), 2.0),
+                ("zoom_all", "fit_screen", words("The whole recording"), 0.0),
+            ):
+                tag(icon_button(icon, text, lambda factor=factor: self.plot.zoom(factor)).classes("ps-act"), name)
 
     def _kind(self, kind: str) -> str:
-        return self.desk.words(KINDS.get(kind, kind))
+        return self.desk.words(CHANNEL_KINDS.get(kind, kind))
 
     # Drawing ------------------------------------------------------------------------------------------------------
 
@@ -181,14 +159,13 @@ class RecordingView:
             self.heading.set_text(words("No recording fits the filter."))
             return
         plotted = desk.review.signals(identity).curves(self.group, low, high)
-        series = curve_styles([self._kind(n) if n == ACTIVITY else words.channel(n) for n in plotted["names"]])
-        y_title = words("Value ({unit})", unit=words.unit(plotted["unit"])) if plotted["unit"] else ""
-        lanes = [(at, self._kind(kind)) for at, kind in plotted["lanes"]]
-        self.plot.show(
+        series = curve_styles([self._kind(n) if n == ACTIVITY else words.channel(n) for n in plotted.names])
+        y_title = words("Value ({unit})", unit=words.unit(plotted.unit)) if plotted.unit else ""
+        lanes = [(at, self._kind(kind)) for at, kind in plotted.lanes]
+        drawing = DrawingSpec(
             identity,
             self._label(),
-            plotted["x"],
-            plotted["curves"],
+            [plotted.x, *plotted.curves],
             series,
             x_title=words("Seconds since the first row (grey: outside the recording)"),
             y_title=words("Deviation from rest (1 = usual)") if self.group == ACTIVITY else y_title,
@@ -196,9 +173,10 @@ class RecordingView:
             limits=(-1.08 - 2.1 * (len(lanes) - 1), 1.08) if lanes else None,
             marks=self._lines(),
             cut=self._cut(),
-            thinned=plotted["thinned"] or low is not None,
+            thinned=plotted.thinned or low is not None,
             keep=keep,
         )
+        self.plot.show(drawing)
         self.refresh()
 
     def refresh(self) -> None:
@@ -296,12 +274,9 @@ class RecordingView:
                 with ui.column().classes("w-full ps-no-gap").props(f'data-check="{f.check}"'):
                     ui.label(finding_text(words, f)).classes("text-bold")
                     ui.label(words.sentence(f.message))
-                    if f.accepted:
-                        with ui.row().classes("items-center"):
-                            ui.label(f"✓ {words('accepted as harmless')}").classes("ps-dim")
-                            finding_button(desk, f, row.id).classes("ps-act")
-                    else:
-                        ui.label(f"→ {advice(words, f)}").classes("ps-dim")
+                    with ui.row().classes("items-center") if f.accepted else contextlib.nullcontext():
+                        what = f"✓ {words('accepted as harmless')}" if f.accepted else f"→ {words(f.action)}"
+                        ui.label(what).classes("ps-dim")
                         finding_button(desk, f, row.id).classes("ps-act")
 
     # Commands -----------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,13 +23,20 @@ from plushsense.dataset import trimming as trim
 from plushsense.dataset.files import IndexStamp
 from plushsense.dataset.index import apply_marks, open_dataset
 from plushsense.dataset.marks import SUGGESTED as BY_SUGGESTION
-from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, apply_mark
+from plushsense.dataset.marks import (
+    LabelledStretch,
+    Mark,
+    MarksFollower,
+    MarkState,
+    append_marks,
+    apply_mark,
+    inverse_marks,
+)
 from plushsense.dataset.onset import Suggestion
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-from plushsense.studio.pages.review.decisions import Decisions, ReviewDecision
 from plushsense.studio.pages.review.signals import (
     GestureOverlay,
     RecordingSignals,
@@ -53,42 +60,6 @@ STATE_TEXTS: Texts = {
     "labelled": "labelled",
 }
 """Names of the states of a recording, and of the filters on them."""
-
-CHECK_NAMES: Texts = {
-    "never-stopped": "never stopped",
-    "too-short": "too short",
-    "duration": "duration",
-    "no-onset": "no start",
-    "several-gestures": "several gestures",
-    "clock-still": "clock stands still",
-    "clock-reset": "clock reset",
-    "clock-value": "wrong clock values",
-    "out-of-order": "rows out of order",
-    "gaps": "gaps",
-    "lost-frames": "lost frames",
-    "rate": "frame rate",
-    "jitter": "uneven clock",
-    "resumed": "resumed stream",
-    "cut-line": "cut line",
-    "malformed": "malformed lines",
-    "rows": "number of rows",
-    "garbage": "invalid values",
-    "blank-rows": "blank rows",
-    "spikes": "spikes",
-    "flat": "constant channel",
-    "zeroed": "constant zero",
-    "stuck": "stuck channel",
-    "saturated": "saturated channel",
-    "drift": "drift",
-    "duplicate": "duplicate",
-    "overlap": "overlap",
-    "not-in-stream": "not in the stream",
-    "missing": "missing recordings",
-    "label": "unknown label",
-    "class-balance": "balance of gestures",
-    "subject-balance": "balance of people",
-}
-"""Names of the checks."""
 
 LOOKING, NONE, SUGGESTED, DRAFT = "looking", "none", "suggested", "draft"
 ACCEPTED, ADJUSTED, EXCLUDED, LABELLED = "accepted", "adjusted", "excluded", "labelled"
@@ -130,7 +101,48 @@ class ReviewedRecording:
 
 ODD = ("never-stopped", "too-short", "duration", "no-onset", "several-gestures", "stuck", "flat")
 """Checks whose findings make a recording stand out among the others of its gesture."""
-_MAX_SIGNALS = 48
+_MAX_SIGNALS, _MAX_VISITS = 48, 50
+
+
+@dataclass(frozen=True)
+class ReviewDecision:
+    """A decision made in a browser tab about recordings, with the states of their marks before and after it."""
+
+    action: str
+    before: Mapping[str, MarkState]
+    after: Mapping[str, MarkState]
+    check: str = ""
+    rows: tuple[int, int] = (0, -1)
+
+    @property
+    def recording(self) -> str:
+        """The only recording, stream or person that the decision is about, or the first one."""
+        return next(iter(self.before))
+
+    def _changed_part(self, marks: MarkState) -> Any:
+        """Return the part of a mark state that the decision changes."""
+        if self.check:
+            return self.check in marks.accepted
+        if self.action in ("exclude", "include"):
+            return marks.excluded
+        if self.action in ("label", "unlabel"):
+            return marks.stretches
+        if self.action == "relabel":
+            return marks.gesture
+        return marks.start, marks.stop, marks.how
+
+    def stands(self, identity: str, now: MarkState) -> bool:
+        """Return whether the marks still state for ``identity`` what the decision made them state."""
+        return bool(self._changed_part(now) == self._changed_part(self.after[identity]))
+
+    def inverse(self, who: str, why: str) -> list[Mark]:
+        """Return the marks that undo the decision."""
+        start, stop = self.rows
+        marks: list[Mark] = []
+        for identity, before in self.before.items():
+            mark = Mark(identity, self.action, who, start=start, stop=stop, check=self.check)
+            marks += inverse_marks(mark, before, who, why)
+        return marks
 
 
 class Review:
@@ -151,7 +163,10 @@ class Review:
         self._stream: RecordingSignals | None = None
         self._marked_source: Any = None
         self._rows: dict[str, ReviewedRecording] = {}
-        self._decisions = Decisions(path)
+        self._marks = MarksFollower(path)
+        self._states = self._marks.states()
+        # The decisions of each browser tab.
+        self._histories: OrderedDict[str, list[ReviewDecision]] = OrderedDict()
         self._open()
         self.prepared = ReviewPreparation(self.changed)
         self._rows_source: Any = None
@@ -194,10 +209,13 @@ class Review:
         Raises:
             DatasetError: if the file of marks is invalid.
         """
+        if self._read_marks():
+            self._changed()
+
+    def _read_marks(self) -> bool:
         with self._lock:
-            if not self._decisions.look():
-                return
-        self._changed()
+            before, self._states = self._states, self._marks.states()
+            return self._states is not before
 
     def _changed(self) -> None:
         self.version += 1
@@ -205,11 +223,11 @@ class Review:
 
     def standing(self, identity: str) -> MarkState:
         """Return the state of a recording, stream or person according to the marks."""
-        return self._decisions.state(identity)
+        return self._states.get(identity, MarkState())
 
     def as_marked(self) -> Dataset:
         """Return a copy of the data set with the current marks applied, for use in another thread."""
-        infos = apply_marks(self.dataset.recordings, dict(self._decisions.states), self.dataset.gestures)
+        infos = apply_marks(self.dataset.recordings, dict(self._states), self.dataset.gestures)
         return Dataset(self.path, self.dataset.head, infos, self.dataset.streams)
 
     def check(self) -> None:
@@ -326,7 +344,7 @@ class Review:
     def _marked(self) -> Dataset:
         """Return `as_marked`, computed again only after a change."""
         with self._lock:
-            source = (self.version, id(self._decisions.states), id(self.dataset))
+            source = (self.version, id(self._states), id(self.dataset))
             if self._marked_source != source:
                 self._marked_source, self._marked_dataset = source, self.as_marked()
             return self._marked_dataset
@@ -397,11 +415,22 @@ class Review:
         check: str = "",
         rows: tuple[int, int] = (0, -1),
     ) -> int:
-        """Decide as in `Decisions.decide`, and notify subscribers."""
+        """Call ``make`` to write marks, store how to undo them as one decision, and return how many states changed."""
         with self._lock:
-            changed = self._decisions.decide(visit, about, action, make, check, rows)
+            self._read_marks()
+            before = {identity: self.standing(identity) for identity in about}
+            make()
+            self._read_marks()
+            after = {i: now for i, then in before.items() if (now := self.standing(i)) != then}
+            if after:
+                earlier = {i: before[i] for i in after}
+                history = self._histories.setdefault(visit, [])
+                history.append(ReviewDecision(action, earlier, after, check, rows))
+                self._histories.move_to_end(visit)
+                while len(self._histories) > _MAX_VISITS:
+                    self._histories.popitem(last=False)
         self._changed()
-        return changed
+        return len(after)
 
     def accept(self, visit: str, identity: str, who: str, ends: bool = False) -> bool:
         """Mark the draft or the suggested rows as the rows to keep; return whether the marks changed.
@@ -504,16 +533,31 @@ class Review:
         make = partial(self.dataset.append_marks, new)
         return self._decide(visit, [m.recording for m in new], new[0].action, make, new[0].check)
 
-    def history(self, visit: str) -> Sequence[ReviewDecision]:
-        """Return the decisions of a browser tab that can be undone, oldest first."""
-        return self._decisions.history(visit)
-
     def undo(self, visit: str, who: str, why: str = "") -> ReviewDecision | None:
-        """Undo the last decision of a browser tab, see `Decisions.undo`."""
+        """Undo the last decision of a browser tab by writing the inverse marks; return None if there is none.
+
+        What was changed elsewhere since stays; the returned decision is about the other recordings only.
+
+        Raises:
+            DatasetError: if everything was changed elsewhere since. The next call undoes an older decision.
+        """
         with self._lock:
-            undone = self._decisions.undo(visit, who, why, self.dataset.generation.check)
-        if undone is not None:
-            self._changed()
+            if not (history := self._histories.get(visit)):
+                return None
+            self._read_marks()
+            last = history[-1]
+            standing = {i: b for i, b in last.before.items() if last.stands(i, self.standing(i))}
+            if not standing:
+                history.pop()
+                raise DatasetError(
+                    "“{recording}” has been changed in another window or program since then, so nothing is undone.",
+                    recording=last.recording,
+                )
+            undone = replace(last, before=standing)
+            append_marks(self.path, undone.inverse(who, why), self.dataset.generation.check)
+            history.pop()
+            self._read_marks()
+        self._changed()
         return undone
 
     # Overlay ------------------------------------------------------------------------------------------------------

@@ -89,7 +89,7 @@ export default {
       const values = (u, splits) => splits.map((v) => (v == null ? "" : number.format(v)));
       // Dots are numbered, so only whole numbers are labelled.
       const counts = p.series.some((s) => s.dots) ? { incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 10000] } : {};
-      const y = { values, stroke: ink, grid, ticks: grid, label: p.y || undefined, labelSize: 22, size: 64 };
+      const y = { values, stroke: ink, grid, ticks: grid, label: p.y_title || undefined, labelSize: 22, size: 64 };
       if (p.lanes.length > 1) {
         y.splits = () => p.lanes.map((lane) => lane[0]);
         y.values = () => p.lanes.map((lane) => lane[1]);
@@ -103,9 +103,9 @@ export default {
         bands: p.bands || [],
         legend: { show: this.legend, live: false },
         cursor: { drag: { x: this.selects, y: false, setScale: false, dist: 4 }, points: { show: false } },
-        scales: { x: { time: false }, y: p.range ? { range: p.range } : {} },
-        axes: [{ ...counts, values, stroke: ink, grid, ticks: grid, label: p.xTitle, labelSize: 22, size: 44 }, y],
-        series: [{ label: p.xTitle }, ...p.series.map((s) => this.style(s))],
+        scales: { x: { time: false }, y: p.limits ? { range: p.limits } : {} },
+        axes: [{ ...counts, values, stroke: ink, grid, ticks: grid, label: p.x_title, labelSize: 22, size: 44 }, y],
+        series: [{ label: p.x_title }, ...p.series.map((s) => this.style(s))],
         hooks: { drawClear: [(u) => this.drawBehind(u)], draw: [(u) => this.drawMarks(u)], setSelect: [(u) => this.select(u)] },
       };
       this.u = new uPlot(options, p.data, this.$refs.place);
@@ -157,7 +157,7 @@ export default {
         ctx.fillText(name, a + 2, top + height - 6 * devicePixelRatio);
       };
       ctx.save();
-      if (this.p.from < 0) fill(x(this.p.from), x(0), "rgba(128,128,128,0.28)");
+      if (this.p.data[0][0] < 0) fill(x(this.p.data[0][0]), x(0), "rgba(128,128,128,0.28)");
       for (const [from, to, style, name] of this.cut || []) fill(x(from), x(to), style || "rgba(213,94,0,0.16)", name);
       ctx.restore();
     },
@@ -205,7 +205,7 @@ export default {
     },
     show(p) {
       if (!this.ready(() => this.show(p))) return;
-      const same = this.u && JSON.stringify([p.series, p.lanes, p.y, p.range]) === this.kind;
+      const same = this.u && JSON.stringify([p.series, p.lanes, p.y_title, p.limits]) === this.kind;
       const kept = this.u && p.id === this.recording && p.keep ? { ...this.u.scales.x } : null;
       this.p = p;
       this.text = p.label;
@@ -214,7 +214,7 @@ export default {
       this.recording = p.id;
       if (same) this.u.setData(p.data, !kept);
       else this.build();
-      this.kind = JSON.stringify([p.series, p.lanes, p.y, p.range]);
+      this.kind = JSON.stringify([p.series, p.lanes, p.y_title, p.limits]);
       if (kept) this.u.setScale("x", { min: kept.min, max: kept.max });
     },
     remark(id, marks, cut, label) {

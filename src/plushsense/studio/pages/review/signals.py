@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,18 +32,7 @@ from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
 from plushsense.dataset.trimming import row_times_s, suggest_trims
 from plushsense.reports.quality import scale_of
 from plushsense.reports.quality_figures import deviation, line
-from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import ChangeSignal
-
-KINDS: Texts = {
-    "all": "All",
-    "activity": "Activity",
-    "capacitive": "Touch",
-    "proximity": "Proximity",
-    "acceleration": "Acceleration",
-    "angular rate": "Rotation",
-}
-"""Names of the groups of channels."""
 
 ALL, ACTIVITY = "all", "activity"
 BEFORE_S = 2.0
@@ -51,6 +40,17 @@ BEFORE_S = 2.0
 _POINTS = 3000
 _LANE = 2.1
 _GRID = 240
+
+
+class PlottedCurves(NamedTuple):
+    """Curves to plot: None is a gap, a ``unit`` of "" means scaled values, ``lanes`` are pairs of position and kind."""
+
+    x: list[float]
+    curves: list[list[float | None]]
+    names: list[str]
+    unit: str
+    lanes: list[tuple[float, str]]
+    thinned: bool
 
 
 @dataclass(frozen=True)
@@ -81,16 +81,13 @@ class RecordingSignals:
         """Return the row nearest to a time; T means the end of the recording."""
         return int(np.abs(self.seconds - second).argmin())
 
-    def curves(self, group: str, low: float | None = None, high: float | None = None) -> dict[str, Any]:
+    def curves(self, group: str, low: float | None = None, high: float | None = None) -> PlottedCurves:
         """Return the curves of a group from ``low`` to ``high`` seconds, thinned to about 3000 points.
 
         If there are several kinds of channels, each kind has its own lane and is scaled by its largest deviation.
-
-        Returns:
-            A dictionary with ``x``, ``curves`` (None for a gap), ``names``, ``unit`` ("" for scaled values),
-            ``lanes`` [(position, kind)] and ``thinned``.
         """
-        at, table, lanes, unit = self.at, self.values, [], ""
+        at, table, unit = self.at, self.values, ""
+        lanes: list[tuple[float, str]] = []
         channels = [i for i, c in enumerate(self.layout.channels) if group in (ALL, c.kind)]
         names = [self.layout.names[i] for i in channels]
         kinds = list(dict.fromkeys(self.layout.channels[i].kind for i in channels))
@@ -114,14 +111,8 @@ class RecordingSignals:
         thinned = len(at) > _POINTS
         if thinned:
             at, table = _thinned(at, table)
-        return {
-            "x": np.round(at, 4).tolist(),
-            "curves": [_plain(column) for column in table.T],
-            "names": names,
-            "unit": unit,
-            "lanes": lanes,
-            "thinned": thinned,
-        }
+        curves = [_plain(column) for column in table.T]
+        return PlottedCurves(np.round(at, 4).tolist(), curves, names, unit, lanes, thinned)
 
 
 def read_signals(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float64]) -> RecordingSignals:

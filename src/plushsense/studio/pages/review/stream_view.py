@@ -8,10 +8,10 @@ from nicegui import background_tasks, run, ui
 
 from plushsense.dataset.marks import HANDLING, PRACTICE, REST
 from plushsense.studio.app.shell import button, icon_button, tag
-from plushsense.studio.app.words import Texts
+from plushsense.studio.app.words import CHANNEL_KINDS, Texts
 from plushsense.studio.pages.review.controller import ReviewController
-from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
-from plushsense.studio.pages.review.signals import ALL, KINDS, RecordingSignals
+from plushsense.studio.pages.review.plot import DrawingSpec, ReviewPlot, curve_styles
+from plushsense.studio.pages.review.signals import ALL, RecordingSignals
 
 _LABELS: Texts = {
     "handling": "Handling",
@@ -72,13 +72,11 @@ class StreamView:
                         icon_button(icon, words(text), lambda f=factor: self.plot.zoom(f)).classes("ps-act")
                     for icon, text, share in (("chevron_left", "Earlier", -0.5), ("chevron_right", "Later", 0.5)):
                         icon_button(icon, words(text), lambda s=share: self.plot.pan(s)).classes("ps-act")
-                ui.label(
-                    words(
-                        "Drag over a stretch between the recordings, or click its beginning and Shift-click its end; "
-                        "then press a button or its key. Keys: + − 0 zoom, ← → move, u undoes, Esc clears the "
-                        "selection."
-                    )
-                ).classes("ps-dim")
+                about = words(
+                    "Drag over a stretch between the recordings, or click its beginning and Shift-click its end; then "
+                    "press a button or its key. Keys: + − 0 zoom, ← → move, u undoes, Esc clears the selection."
+                )
+                ui.label(about).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
                 ui.label(words("Labelled stretches")).classes("text-bold")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "stretches")
@@ -97,21 +95,21 @@ class StreamView:
             if signals is None or stream != desk.stream:
                 return
             plotted = signals.curves(ALL, low, high)
-            lanes = [(at, words(KINDS.get(kind, kind))) for at, kind in plotted["lanes"]]
-            self.plot.show(
+            lanes = [(at, words(CHANNEL_KINDS.get(kind, kind))) for at, kind in plotted.lanes]
+            drawing = DrawingSpec(
                 stream,
                 self._about(signals),
-                plotted["x"],
-                plotted["curves"],
-                curve_styles([words.channel(n) for n in plotted["names"]]),
+                [plotted.x, *plotted.curves],
+                curve_styles([words.channel(n) for n in plotted.names]),
                 x_title=words("Seconds since the first row of the stream"),
-                y_title=words("Value ({unit})", unit=words.unit(plotted["unit"])) if plotted["unit"] else "",
+                y_title=words("Value ({unit})", unit=words.unit(plotted.unit)) if plotted.unit else "",
                 lanes=lanes,
                 limits=(-1.08 - 2.1 * (len(lanes) - 1), 1.08) if lanes else None,
                 cut=self._shaded(signals),
-                thinned=plotted["thinned"] or low is not None,
+                thinned=plotted.thinned or low is not None,
                 keep=low is not None,
             )
+            self.plot.show(drawing)
             self._drawn = None
             self._update(signals)
 

@@ -12,8 +12,8 @@ from plushsense.dataset.quality.findings import Finding
 from plushsense.studio.app.shell import AFFECT_SIGNS, button, icon_button, scroll_region, tag
 from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.pages.review.controller import SORTS, ReviewController
-from plushsense.studio.pages.review.review import CHECK_NAMES, STATE_TEXTS, ReviewedRecording
-from plushsense.studio.widgets.elements import on_enter
+from plushsense.studio.pages.review.review import STATE_TEXTS, ReviewedRecording
+from plushsense.studio.widgets.elements import on_enter, open_dialog
 
 _HEADS: Texts = {
     "recording": "Recording",
@@ -29,55 +29,6 @@ _SEVERITIES: Texts = {
     "error": "to decide",
     "warning": "to look at",
     "info": "good to know",
-}
-
-ADVICE: Texts = {
-    "never-stopped": "Trim it to the gesture, or exclude it.",
-    "too-short": "Exclude it, or record it again.",
-    "duration": "Look at its plot; trim or exclude it, or accept the finding.",
-    "no-onset": "Look whether the gesture was made; exclude it if not.",
-    "several-gestures": "Trim it to one gesture, or exclude it.",
-    "clock-still": "Export the file again with all digits of its times, and import it again.",
-    "clock-reset": "Trim it to one side of the reset, or exclude it.",
-    "clock-value": "Check the cable: reading leaves out each such row.",
-    "out-of-order": "Check the radio: reading leaves out a single such row, and starts anew at several.",
-    "gaps": "Exclude it if the gesture is hit, or accept the finding.",
-    "lost-frames": "Check cable and radio; exclude it if the gesture is hit.",
-    "rate": "Check firmware and layout; training resamples it.",
-    "jitter": "Nothing to do: the clock is evened out.",
-    "resumed": "Nothing to do: reading starts anew there.",
-    "cut-line": "Nothing to do: that line is left out.",
-    "malformed": "Nothing to do: these lines are left out.",
-    "rows": "Compare it with the original file, or accept the finding.",
-    "garbage": "Check the sensor; exclude it if the gesture is hit.",
-    "blank-rows": "Check the sensor; exclude it if the gesture is hit.",
-    "spikes": "Check the sensor; exclude it if the gesture is hit.",
-    "flat": "Check the sensor's cable; exclude what it spoiled.",
-    "zeroed": "The values are lost; record again.",
-    "stuck": "Check the sensor; exclude it if the gesture is hit.",
-    "saturated": "Widen the sensor's range, or accept strong touch.",
-    "drift": "Let the toy calibrate again between gestures.",
-    "duplicate": "Exclude one of the two.",
-    "overlap": "Trim or exclude one of the two.",
-    "not-in-stream": "Check that the stream is that of this session.",
-    "missing": "Record them if the person is still there, or accept the finding.",
-    "label": "Set another gesture for these recordings, or import them with a gesture set that has the label.",
-    "class-balance": "Weight the gestures in training, or leave odd ones out.",
-    "subject-balance": "Record more people or recordings.",
-    "clock-reset-stream": "Nothing to do: reading starts anew there.",
-    "gaps-stream": "Nothing to do: reading starts anew there.",
-}
-
-_REASONS: Texts = {
-    "wrong": "wrong gesture",
-    "nothing": "gesture not performed",
-    "disturbed": "disturbed from outside",
-    "sensor": "sensor fault",
-    "twice": "recorded twice",
-    "broken_off": "broken off",
-    "looked": "looked at: it is fine",
-    "person": "this person's way of doing it",
-    "known": "known fault of the device that does not affect the gesture",
 }
 
 
@@ -122,25 +73,12 @@ class ReviewTable(Element, component="review_table.js"):
 
 
 SEVERITY_SIGNS = {"error": "✖", "warning": "▲", "info": "ℹ"}
-_EXCLUDING = ("wrong", "nothing", "disturbed", "sensor", "twice", "broken_off")
-_ACCEPTING = ("looked", "person", "known")
 
 
 def finding_text(words: Words, finding: Finding) -> str:
     """Return a short text for a finding: its sign, severity and check."""
     severity = words(_SEVERITIES[finding.severity])
-    return f"{SEVERITY_SIGNS[finding.severity]} {severity}: {check_name(words, finding.check)}"
-
-
-def check_name(words: Words, check: str) -> str:
-    """Return the name of a check in this language."""
-    return words(CHECK_NAMES.get(check, check))
-
-
-def advice(words: Words, finding: Finding) -> str:
-    """Return what a check advises to do about a finding, in this language."""
-    of_stream = ADVICE.get(f"{finding.check}-stream") if finding.stream else None
-    return words(of_stream or ADVICE.get(finding.check, finding.action))
+    return f"{SEVERITY_SIGNS[finding.severity]} {severity}: {words.check(finding.check)}"
 
 
 def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
@@ -163,13 +101,27 @@ def ask_reason(
         excluded: called with the reason instead, to exclude the selected recordings.
     """
     words, recording = desk.words, desk.current
+    reasons = words.each(
+        "wrong gesture",
+        "gesture not performed",
+        "disturbed from outside",
+        "sensor fault",
+        "recorded twice",
+        "broken off",
+    )
+    if finding is not None:
+        reasons = words.each(
+            "looked at: it is fine",
+            "this person's way of doing it",
+            "known fault of the device that does not affect the gesture",
+        )
     if excluded is not None:
         title = words("Why are the selected recordings ({n}) excluded?", n=len(desk.selected))
     elif finding is None:
         title = words("Why is {id} excluded?", id=recording)
     else:
         about = finding.about or desk.review.dataset.head.name
-        title = words("Why is “{check}” harmless in {about}?", check=check_name(words, finding.check), about=about)
+        title = words("Why is “{check}” harmless in {about}?", check=words.check(finding.check), about=about)
 
     async def answer(why: str) -> None:
         if not why.strip():
@@ -185,24 +137,18 @@ def ask_reason(
         else:
             await desk.decide(recording, lambda: review.accept_finding(visit, finding, desk.name, why))
 
-    with desk.page_slot, ui.dialog() as dialog:
-        # Close without a transition, because the next key press is a command of the page again.
-        dialog.props(f'aria-label="{words("Reason")}" transition-duration=0')
-        with tag(ui.card().classes("w-full"), "reason"):
-            ui.label(title).classes("text-lg text-bold").style("overflow-wrap: anywhere")
-            with ui.row().classes("ps-small-gap"):
-                for number, key in enumerate(_EXCLUDING if finding is None else _ACCEPTING):
-                    reason = words(_REASONS[key])
-                    look = "outline autofocus" if number == 0 else "outline"
-                    button("", reason, lambda reason=reason: answer(reason), look)
-            field = ui.input(words("Another reason")).classes("w-full")
-            on_enter(tag(field, "own-reason"), lambda: answer(field.value or ""))
-            with ui.row().classes("w-full justify-end"):
-                button("", words("Cancel"), dialog.close, "flat")
-                go = words("Exclude") if finding is None else words("Harmless …")
-                button("reason-go", go, lambda: answer(field.value or ""), "unelevated")
-    dialog.on("hide", dialog.delete)
-    dialog.open()
+    with open_dialog(words("Reason"), "reason", "w-full") as dialog:
+        ui.label(title).classes("text-lg text-bold ps-break")
+        with ui.row().classes("ps-small-gap"):
+            for number, reason in enumerate(reasons):
+                look = "outline autofocus" if number == 0 else "outline"
+                button("", reason, lambda reason=reason: answer(reason), look)
+        field = ui.input(words("Another reason")).classes("w-full")
+        on_enter(tag(field, "own-reason"), lambda: answer(field.value or ""))
+        with ui.row().classes("w-full justify-end"):
+            button("", words("Cancel"), dialog.close, "flat")
+            go = words("Exclude") if finding is None else words("Harmless …")
+            button("reason-go", go, lambda: answer(field.value or ""), "unelevated")
 
 
 def recorded_as(words: Words, row: ReviewedRecording) -> str:
@@ -233,26 +179,21 @@ def ask_gesture(
         dialog.close()
         await answer(gesture, (why.value or "").strip())
 
-    with desk.page_slot, ui.dialog() as dialog:
-        dialog.props(f'aria-label="{words("Another gesture")}" transition-duration=0')
-        with tag(ui.card().classes("w-full"), "relabelling"):
-            ui.label(title).classes("text-lg text-bold").style("overflow-wrap: anywhere")
-            choice = ui.select(options, value=now if now in options else None, label=words("Gesture"))
-            tag(choice.props("options-dense").classes("w-full"), "new-gesture")
-            why = tag(ui.input(words("Reason (optional)")).classes("w-full"), "relabel-why")
-            ui.label(
-                words(
-                    "The recording itself is not changed: the name of its file still says what was asked for. "
-                    "Checks, training and publishing use the new gesture."
-                )
-            ).classes("ps-dim")
-            with ui.row().classes("w-full justify-end"):
-                button("", words("Cancel"), dialog.close, "flat")
-                if any(r.info.gesture != r.info.recorded for r in rows):
-                    button("relabel-restore", words("As recorded"), lambda: done(""), "flat")
-                button("relabel-go", words("Set the gesture"), lambda: done(choice.value), "unelevated")
-    dialog.on("hide", dialog.delete)
-    dialog.open()
+    with open_dialog(words("Another gesture"), "relabelling", "w-full") as dialog:
+        ui.label(title).classes("text-lg text-bold ps-break")
+        choice = ui.select(options, value=now if now in options else None, label=words("Gesture"))
+        tag(choice.props("options-dense").classes("w-full"), "new-gesture")
+        why = tag(ui.input(words("Reason (optional)")).classes("w-full"), "relabel-why")
+        about = words(
+            "The recording itself is not changed: the name of its file still says what was asked for. Checks, training "
+            "and publishing use the new gesture."
+        )
+        ui.label(about).classes("ps-dim")
+        with ui.row().classes("w-full justify-end"):
+            button("", words("Cancel"), dialog.close, "flat")
+            if any(r.info.gesture != r.info.recorded for r in rows):
+                button("relabel-restore", words("As recorded"), lambda: done(""), "flat")
+            button("relabel-go", words("Set the gesture"), lambda: done(choice.value), "unelevated")
 
 
 PER_PAGE = 50
@@ -294,7 +235,8 @@ class RecordingTableView:
                 self.all = button("select-all", "", self._select_all, "flat dense")
                 with ui.row().classes("items-center ps-small-gap") as self.acts:
                     if not desk.review.is_labelled:
-                        button("accept-selected", words("Accept suggestions"), self._accept)
+                        accept = words("Accept suggestions")
+                        button("accept-selected", accept, lambda: self._accept(list(desk.selected)))
                     button("exclude-selected", words("Exclude …"), lambda: ask_reason(desk, None, self._exclude))
                     button("include-selected", words("Include again"), self._include)
                     button("relabel-selected", words("Another gesture …"), self._relabel)
@@ -396,9 +338,7 @@ class RecordingTableView:
         return self.desk.review.surer_than((self.percent.value or 0) / 100, self.desk.order)
 
     async def _accept_sure(self) -> None:
-        desk, surer, above = self.desk, self._surer(), (self.percent.value or 0) / 100
-        review, ends = desk.review, desk.ends
-        await desk.decide_all(lambda: review.accept_above(desk.visit, surer, desk.name, above, ends), "trim")
+        await self._accept(self._surer(), (self.percent.value or 0) / 100)
 
     def _show_selection(self) -> None:
         desk, words = self.desk, self.desk.words
@@ -436,10 +376,10 @@ class RecordingTableView:
         self.desk.selected.clear()
         self.draw()
 
-    async def _accept(self) -> None:
-        desk, chosen = self.desk, list(self.desk.selected)
+    async def _accept(self, chosen: list[str], above: float = 0.0) -> None:
+        desk = self.desk
         review, ends = desk.review, desk.ends
-        await desk.decide_all(lambda: review.accept_above(desk.visit, chosen, desk.name, 0.0, ends), "trim")
+        await desk.decide_all(lambda: review.accept_above(desk.visit, chosen, desk.name, above, ends), "trim")
 
     async def _exclude(self, why: str) -> None:
         desk, chosen = self.desk, list(self.desk.selected)

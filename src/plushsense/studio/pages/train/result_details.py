@@ -22,8 +22,8 @@ from plushsense.studio.app.shell import (
     scroll_region,
     tag,
 )
-from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.train.stored_results import (
     EVALUATION,
     HELD_BACK,
     LINKS,
@@ -37,26 +37,13 @@ from plushsense.studio.pages.train.results import (
     context_text,
     counted,
     figure,
+    leaky_warning,
     score_labels,
     score_text,
     split_text,
-    whole,
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits
 from plushsense.studio.widgets.elements import table_html
-
-_HEADS: Texts = {
-    "person": "Person",
-    "recordings": "Recordings",
-    "windows": "Windows",
-    "accuracy": "Accuracy",
-    "macro_f1": "Macro-F1",
-    "by_recording": "Accuracy by recording",
-    "gesture": "Gesture",
-    "predicted": "Read as",
-    "of_windows": "Windows with this answer",
-    "person_of": "Recording",
-}
 
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
 
@@ -96,35 +83,23 @@ class ResultDetailsView:
                 ui.space()
                 icon_button("close", w("Close"), self._close, color=None)
             if row.leaky:
-                ui.label(
-                    w(
-                        "Leaky: parts of one recording are on both sides of this split, so the score is too good. "
-                        "Never report it as the score for new people."
-                    )
-                )
+                ui.label(leaky_warning(w))
             tag(ui.label(headline(w, row)).classes("text-bold"), "details-verdict")
             for sentence in limits(w, row):
                 ui.label(sentence)
             tag(ui.label(figures(w, row)).classes("ps-dim"), "details-figures")
-            ui.label(
-                w(
-                    "{parameters} parameters, {macs} multiply-accumulates in 50 ms.",
-                    parameters=whole(w, row.parameters),
-                    macs=whole(w, row.macs),
-                )
-            ).classes("ps-dim")
+            sizes = {"parameters": w.count(row.parameters), "macs": w.count(row.macs)}
+            ui.label(w("{parameters} parameters, {macs} multiply-accumulates in 50 ms.", **sizes)).classes("ps-dim")
             if row.kind == TRAINING:
                 self._training(d)
             if d.by_gesture is not None:
                 self._confusions(d)
             elif d.later:
-                button(
-                    "show-confusions", w("Show the confusions of the validation people"), self._compute, icon="grid_on"
-                )
+                show = w("Show the confusions of the validation people")
+                button("show-confusions", show, self._compute, icon="grid_on")
             else:
-                ui.label(w("No confusions are stored for this result. Evaluate the network to see them.")).classes(
-                    "ps-dim"
-                )
+                none = w("No confusions are stored for this result. Evaluate the network to see them.")
+                ui.label(none).classes("ps-dim")
             if d.people:
                 self._people(d)
 
@@ -167,25 +142,20 @@ class ResultDetailsView:
     def _confusions(self, d: ResultDetails) -> None:
         w = self._words
         heading(w("Confusions"), 4)
-        ui.label(
-            w(
-                "Rows: the true gesture. Columns: the answer of the network. Each cell has the number of windows and "
-                "their share of the row. Click a number to see the recordings."
-                if d.clickable
-                else "For this network only the counts are stored. Evaluate it to see the recordings behind them."
-            )
-        ).classes("ps-dim")
+        about = w(
+            "Rows: the true gesture. Columns: the answer of the network. Each cell has the number of windows and their "
+            "share of the row. Click a number to see the recordings."
+            if d.clickable
+            else "For this network only the counts are stored. Evaluate it to see the recordings behind them."
+        )
+        ui.label(about).classes("ps-dim")
         if d.pooled is not None and d.row.rest is not None:
-            tag(
-                ui.label(
-                    w(
-                        "Pooled over all windows at once, with recordings at rest, the accuracy is {pooled}. The "
-                        "matrix counts in this way.",
-                        pooled=figure(w, d.pooled),
-                    )
-                ).classes("ps-dim"),
-                "pooled",
+            text = w(
+                "Pooled over all windows at once, with recordings at rest, the accuracy is {pooled}. The matrix counts "
+                "in this way.",
+                pooled=figure(w, d.pooled),
             )
+            tag(ui.label(text).classes("ps-dim"), "pooled")
         choices = {"gesture": w("By gesture"), "affect": w("By affect")}
         radio = ui.radio(choices, value=self._by, on_change=self._group).props("inline")
         tag(radio, "by").props(f'aria-label="{w("Confusions")}"')
@@ -239,16 +209,13 @@ class ResultDetailsView:
                 n=len(rows),
                 windows=windows,
             )
-            link = await run.io_bound(self._link, d.row.dataset, [row.recording for row in rows], title)
+            # Without a data set, as one that is not in this studio, there is nothing to review.
+            dataset, ids = d.row.dataset, [row.recording for row in rows]
+            selections = self._page.workspace.part(Selections)
+            link = await run.io_bound(selections.address, Path(dataset), ids, title) if dataset else ""
             # Ignore this answer if another cell was clicked or another result opened in the meantime.
             if link is not None and click == self._clicks and self._details is d:
                 self._list(d, title, link, rows)
-
-    def _link(self, dataset: str, recordings: list[str], title: str) -> str:
-        """Return the address of the review page for these recordings, or "" if the data set is not in this studio."""
-        if not dataset:
-            return ""
-        return self._page.workspace.part(Selections).address(Path(dataset), recordings, title)
 
     def _gestures(self, label: str) -> list[str]:
         """Return the gestures that a label of the displayed matrix includes: one gesture, or all with this affect."""
@@ -284,7 +251,7 @@ class ResultDetailsView:
                 high=figure(w, max(scores)),
             )
             tag(ui.label(text), "spread")
-        head = [w(_HEADS[k]) for k in ("person", "recordings", "windows", "accuracy", "macro_f1", "by_recording")]
+        head = w.each("Person", "Recordings", "Windows", "Accuracy", "Macro-F1", "Accuracy by recording")
         keys = ("accuracy", "macro_f1", "by_recording_accuracy")
         cells = [(p["subject"], p["recordings"], p["windows"], *(figure(w, p[key]) for key in keys)) for p in d.people]
         with scroll_region(w("Scores of each person")):
@@ -310,12 +277,8 @@ def confusion_table(w: Words, confusion: Confusion, by_affect: bool, clickable: 
             text = Markup("{}<small>{:.0f} %</small>").format(n, 100 * share)
             if clickable:
                 button = Markup('<button data-cell="{},{}">{}<span class="ps-visually-hidden">{}</span></button>')
-                text = button.format(
-                    i,
-                    j,
-                    text,
-                    w("{truth} read as {predicted}. Show the recordings", truth=names[i], predicted=names[j]),
-                )
+                hint = w("{truth} read as {predicted}. Show the recordings", truth=names[i], predicted=names[j])
+                text = button.format(i, j, text, hint)
             shade = f"background: rgba(0, 114, 178, {0.06 + 0.44 * share:.2f})"
             cells.append(Markup('<td class="{}" style="{}">{}</td>').format(kind, shade, text))
         rows.append(Markup('<tr><th scope="row">{}</th>{}</tr>').format(names[i], Markup("").join(cells)))
@@ -343,7 +306,7 @@ def worst_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool
             button = Markup('<button data-cell="{},{}">{}</button>')
             text = button.format(i, j, text)
         rows.append((text, f"{n}", f"{100 * share:.0f} %"))
-    head = [w("Most frequent confusions"), w("Windows"), w("Of this gesture")]
+    head = w.each("Most frequent confusions", "Windows", "Of this gesture")
     return table_html(head, rows, numbers=(1, 2)) if rows else Markup("")
 
 
@@ -364,5 +327,4 @@ def _recordings(w: Words, dataset: str, rows: Sequence[MisreadRecording]) -> Mar
             )
         predicted = ", ".join(w.gesture(label) for label in row.predicted)
         cells.append((row.subject, w.gesture(row.gesture), predicted, f"{row.windows} / {row.of}", link))
-    head = [w(_HEADS[key]) for key in ("person", "gesture", "predicted", "of_windows", "person_of")]
-    return table_html(head, cells)
+    return table_html(w.each("Person", "Gesture", "Read as", "Windows with this answer", "Recording"), cells)

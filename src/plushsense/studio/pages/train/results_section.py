@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any
 
 from markupsafe import Markup
@@ -16,7 +17,7 @@ from plushsense.scoring.metrics import pareto_front
 from plushsense.studio.app.shell import Page, heading, html, named, scroll_region, section, tag
 from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.pages.train.result_details import ResultDetailsView
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.stored_results import (
     EVALUATION,
     TRAINING,
     TRIAL,
@@ -27,11 +28,10 @@ from plushsense.studio.pages.train.results import (
     score_labels,
     score_text,
     split_text,
-    whole,
 )
 from plushsense.studio.widgets.elements import table_html
 
-_COLUMNS_TEXTS: Texts = {
+_COLUMNS: Texts = {
     "data": "Data",
     "kind": "Kind",
     "network": "Network",
@@ -44,7 +44,6 @@ _COLUMNS_TEXTS: Texts = {
     "macro_f1": "Macro-F1",
     "parameters": "Parameters",
     "when": "Date",
-    "open": "Open",
 }
 
 _KINDS: Texts = {
@@ -56,19 +55,12 @@ _KINDS: Texts = {
 _MAX_ROWS = 60
 _NONE = float("-inf")
 
-# Sort key of each column.
+# Sort keys of the columns, of others the value itself.
 _SORTS: dict[str, Callable[[ResultRow], Any]] = {
-    "data": lambda r: r.data,
-    "kind": lambda r: r.kind,
-    "network": lambda r: r.network,
-    "schedule": lambda r: r.schedule,
     "split": lambda r: (r.leaky, r.split),
-    "context": lambda r: r.context,
-    "seeds": lambda r: r.seeds,
     "over": lambda r: (r.spread, r.units),
     "accuracy": lambda r: _NONE if r.accuracy is None else r.accuracy,
     "macro_f1": lambda r: _NONE if r.macro_f1 is None else r.macro_f1,
-    "parameters": lambda r: r.parameters,
     "when": lambda r: r.when_s,
 }
 _NUMBERS = ("over", "accuracy", "macro_f1", "parameters")
@@ -88,12 +80,11 @@ class ResultsSection:
         self._open = ""
         w = self._words
         with section(w("Results"), classes=""):
-            ui.label(
-                w(
-                    "Compare scores only if data, split and context are the same. A training has one seed and was "
-                    "checked on a few people: do not report its score."
-                )
-            ).classes("ps-dim")
+            about = w(
+                "Compare scores only if data, split and context are the same. A training has one seed and was checked "
+                "on a few people: do not report its score."
+            )
+            ui.label(about).classes("ps-dim")
             with ui.row().classes("items-center"):
                 self._by_data = ui.select({"": w("all data sets")}, value="", label=w("Data set"))
                 tag(self._by_data.classes("w-64"), "filter-data").on_value_change(self._filtered)
@@ -134,7 +125,7 @@ class ResultsSection:
 
     async def _clicked(self, event: Any) -> None:
         action, _, which = str(event.args).partition(":")
-        if action == "sort" and which in _SORTS:
+        if action == "sort" and which in _COLUMNS:
             self._down = not self._down if which == self._sort else which in _DOWN
             self._sort = which
             self._draw()
@@ -155,7 +146,7 @@ class ResultsSection:
 
     def _draw(self) -> None:
         chosen = [r for r in self._rows if self._data in ("", r.data) and self._kind in ("", r.kind)]
-        chosen.sort(key=_SORTS[self._sort], reverse=self._down)
+        chosen.sort(key=_SORTS.get(self._sort) or attrgetter(self._sort), reverse=self._down)
         empty = Markup('<p class="ps-dim">{}</p>').format(
             self._words("There are no results yet. Train or evaluate a network above.")
         )
@@ -165,13 +156,13 @@ class ResultsSection:
     def _as_table(self, rows: list[ResultRow]) -> Markup:
         w = self._words
         head = [Markup('<th scope="col">{}</th>').format(w("Open"))]
-        for key in _SORTS:
+        for key, title in _COLUMNS.items():
             sorts = key == self._sort
             state = f' aria-sort="{"descending" if self._down else "ascending"}"' if sorts else ""
             arrow = (" ▼" if self._down else " ▲") if sorts else ""
             kind = ' class="ps-number"' if key in _NUMBERS else ""
             cell = Markup(f'<th scope="col"{kind}{state}><button data-do="sort:{key}">{{}}{arrow}</button></th>')
-            head.append(cell.format(w(_COLUMNS_TEXTS[key])))
+            head.append(cell.format(w(title)))
         body = Markup("").join(self._as_row(row) for row in (rows if self._all else rows[:_MAX_ROWS]))
         more = Markup("")
         if len(rows) > _MAX_ROWS and not self._all:
@@ -194,13 +185,13 @@ class ResultsSection:
             "over": averaged_over(w, row.spread, row.units),
             "accuracy": score_text(w, row.accuracy, row.accuracy_sd),
             "macro_f1": score_text(w, row.macro_f1, row.macro_f1_sd),
-            "parameters": whole(w, row.parameters),
+            "parameters": w.count(row.parameters),
             "when": Markup(time.strftime('<span class="ps-nowrap">%Y-%m-%d</span> %H:%M', time.localtime(row.when_s))),
         }
         name = row.path.stem if row.kind == TRAINING else row.network
         columns = Markup("").join(
             Markup('<td class="{}" data-column="{}" data-label="{}">{}</td>').format(
-                "ps-number" if key in _NUMBERS else "", key, w(_COLUMNS_TEXTS[key]), text
+                "ps-number" if key in _NUMBERS else "", key, w(_COLUMNS[key]), text
             )
             for key, text in cells.items()
         )
@@ -234,27 +225,22 @@ class ResultsSection:
                 labels = tag(html(), "pareto-marks")
             plot = ui.echart({}, renderer="svg").classes("ps-pareto")
             tag(plot, "pareto").props('role="img"')
-            ui.label(
-                w(
-                    "Only results on the same people and gestures of the same data. Bars: standard deviation. Bold: "
-                    "no other network is both as good and smaller."
-                )
-            ).classes("ps-dim")
-            with tag(
-                ui.expansion(w("The data of the plot as a table"), icon="table_rows").classes("w-full"), "pareto-data"
-            ):
+            about = w(
+                "Only results on the same people and gestures of the same data. Bars: standard deviation. Bold: no "
+                "other network is both as good and smaller."
+            )
+            ui.label(about).classes("ps-dim")
+            data = ui.expansion(w("The data of the plot as a table"), icon="table_rows").classes("w-full")
+            with tag(data, "pareto-data"):
                 table = tag(html().classes("ps-scroll-x"), "pareto-table")
 
         def draw() -> None:
             group = groups[self._group]
             labels.set_content(score_labels(w, group[0].leaky, group[0].simulated))
-            named(
-                plot,
-                w(
-                    "Macro-F1 against the number of parameters, {n} networks; the front is joined by a line",
-                    n=len(group),
-                ),
+            label = w(
+                "Macro-F1 against the number of parameters, {n} networks; the front is joined by a line", n=len(group)
             )
+            named(plot, label)
             plot.options.clear()
             plot.options.update(pareto_options(w, group))
             plot.update()
@@ -366,12 +352,12 @@ def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, Any]:
 def pareto_table(w: Words, rows: Sequence[ResultRow]) -> Markup:
     """Render the data of the plot as a table, smallest network first."""
     ids = {row.id for row in pareto_rows(rows)}
-    head = [w(_COLUMNS_TEXTS[key]) for key in ("network", "schedule", "parameters", "macro_f1")]
+    head = [w(_COLUMNS[key]) for key in ("network", "schedule", "parameters", "macro_f1")]
     cells = [
         (
             row.network,
             f"{row.schedule} ({w('leaky')})" if row.leaky else row.schedule,
-            whole(w, row.parameters),
+            w.count(row.parameters),
             score_text(w, row.macro_f1, row.macro_f1_sd),
             "✓" if row.id in ids else "–",
         )
@@ -388,7 +374,7 @@ def _point(w: Words, row: ResultRow, front: bool, middle: float) -> dict[str, An
     name = f"{row.network.rpartition(' ')[0]}, {row.schedule.partition(', ')[2]}"
     if row.leaky:
         name = f"{name} ({w('leaky')})"
-    text = f"{name}: {whole(w, row.parameters)}, {score_text(w, row.macro_f1, row.macro_f1_sd)}"
+    text = f"{name}: {w.count(row.parameters)}, {score_text(w, row.macro_f1, row.macro_f1_sd)}"
     hollow = {"color": _BACKGROUND, "borderColor": _FRONT, "borderWidth": 2.5}
     return {
         "name": name,

@@ -8,7 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.stored_results import (
     EVALUATION,
     HELD_BACK,
     SUBJECTS,

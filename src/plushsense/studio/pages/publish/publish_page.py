@@ -9,11 +9,11 @@ from nicegui import run, ui
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.store import Dataset
 from plushsense.studio.app.jobs import StudioJob
-from plushsense.studio.app.shell import Page, button, focus, query, tag
+from plushsense.studio.app.shell import Page, button, query, tag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
-from plushsense.studio.pages.publish.statements import Field, StatementsForm, beside, watched
+from plushsense.studio.pages.publish.statements import StatementsForm, ask_again, beside, watched
 from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_to, style, text, titles
 
 _STAGE_TEXTS: Texts = {
@@ -37,8 +37,8 @@ _SWITCHES_ABOUT: Texts = {
 }
 
 _MAX_CODES = 5
-
-
+# For the explanation below a checkbox.
+_BELOW = "margin: -12px 0 0 40px"
 _TASKS = ("publish", "validate")
 _STAGES = {"recognising people": "recognising", "writing": "writing"}
 
@@ -58,34 +58,23 @@ class _Publishing:
     async def build(self) -> None:
         words = self.words
         style()
-        text(
-            words(
-                "Makes a package of a data set that others can use, and checks it with the validators of each format."
-            ),
-            classes="ps-dim",
+        about = words(
+            "Makes a package of a data set that others can use, and checks it with the validators of each format."
         )
+        text(about, classes="ps-dim")
         with ui.row().classes("ps-message ps-message-warning w-full items-center no-wrap"):
             ui.icon("lock").props('aria-hidden="true"')
-            tag(
-                text(
-                    words(
-                        "Nothing is uploaded. The package stays on this computer until you give it to somebody, and "
-                        "a copy that you gave away cannot be called back. Publish only what the consent forms allow."
-                    )
-                ),
-                "danger",
+            danger = words(
+                "Nothing is uploaded. The package stays on this computer until you give it to somebody, and a copy "
+                "that you gave away cannot be called back. Publish only what the consent forms allow."
             )
+            tag(text(danger), "danger")
         if "publish" in self.lacking:
-            tag(
-                notice(
-                    words(
-                        "The validators are not installed, so nothing can be published or checked. Run  pip install "
-                        "'plushsense[publish]'  and start the studio again."
-                    ),
-                    "error",
-                ),
-                "missing-publish",
+            advice = words(
+                "The validators are not installed, so nothing can be published or checked. Run  pip install "
+                "'plushsense[publish]'  and start the studio again."
             )
+            tag(notice(advice, "error"), "missing-publish")
         await self._form()
         self.work = WorkPanel(self.page, _TASKS, self._progress_text, self._ended, self._allow)
         self._allow()
@@ -100,10 +89,8 @@ class _Publishing:
         with tag(ui.column().classes("ps-card w-full"), "new"):
             text(words("New package"), "h2")
             if not options:
-                tag(
-                    text(words("There is no data set yet. Record a session, or import recordings on the home page.")),
-                    "no-dataset",
-                )
+                none = words("There is no data set yet. Record a session, or import recordings on the home page.")
+                tag(text(none), "no-dataset")
                 return
             dataset = self.query.get("dataset", "")
             first = dataset if dataset in options else next(iter(options))
@@ -153,19 +140,15 @@ class _Publishing:
         for key in _SWITCHES:
             box = ui.checkbox(words(_SWITCHES[key]), value=key in ("streams", "reidentification"))
             self._switches[key] = tag(box, f"with-{key}")
-            text(words(_SWITCHES_ABOUT[key]), classes="ps-dim").style("margin: -12px 0 0 40px")
+            text(words(_SWITCHES_ABOUT[key]), classes="ps-dim").style(_BELOW)
         if "baselines" in self.lacking:
             self._switches["reidentification"].set_value(False)
             self._switches["reidentification"].set_enabled(False)
-            tag(
-                notice(
-                    words(
-                        "Re-identification cannot be tested. Run  pip install 'plushsense[baselines]'  and start the "
-                        "studio again. Without the test, the package says that it was not made."
-                    )
-                ),
-                "missing-baselines",
+            advice = words(
+                "Re-identification cannot be tested. Run  pip install 'plushsense[baselines]'  and start the studio "
+                "again. Without the test, the package says that it was not made."
             )
+            tag(notice(advice), "missing-baselines")
         if chosen.own_codes:
             codes = ", ".join(chosen.own_codes[:_MAX_CODES]) + (" …" if len(chosen.own_codes) > _MAX_CODES else "")
             simulated = chosen.dataset is not None and chosen.dataset.head.simulated
@@ -177,31 +160,23 @@ class _Publishing:
             tag(notice(advice, "info" if simulated else "warning"), "advice")
         self._pseudonyms = tag(ui.checkbox(words("Give the people new random codes")), "with-pseudonyms")
         self._pseudonyms.on_value_change(self._require_key)
-        text(
-            words(
-                "Who has which code is in the key file. Move it to a safe place apart from the data, and keep a "
-                "second copy: it is not part of any backup. Never publish it."
-            ),
-            classes="ps-dim",
-        ).style("margin: -12px 0 0 40px")
+        about = words(
+            "Who has which code is in the key file. Move it to a safe place apart from the data, and keep a second "
+            "copy: it is not part of any backup. Never publish it."
+        )
+        text(about, classes="ps-dim").style(_BELOW)
         self._keep = tag(ui.checkbox(words("Shift the dates of later versions in the same way")), "with-key")
-        text(
-            words(
-                "The shifts come from a secret key, which is kept. Otherwise they are drawn again each time and not "
-                "stored."
-            ),
-            classes="ps-dim",
-        ).style("margin: -12px 0 0 40px")
+        about = words(
+            "The shifts come from a secret key, which is kept. Otherwise they are drawn again each time and not stored."
+        )
+        text(about, classes="ps-dim").style(_BELOW)
         field = ui.input(words("Key file"), value=f"{chosen.path.name}.key").props("maxlength=64").classes("w-full")
         self._key = watched(tag(field.bind_visibility_from(self._keep, "value"), "key"))
-        where = text(
-            words(
-                "Key files are in {folder}, outside of data sets and packages. An existing key file is used again.",
-                folder=str(self.workspace.folder / KEYS),
-            ),
-            classes="ps-dim",
+        where = words(
+            "Key files are in {folder}, outside of data sets and packages. An existing key file is used again.",
+            folder=str(self.workspace.folder / KEYS),
         )
-        where.bind_visibility_from(self._keep, "value")
+        text(where, classes="ps-dim").bind_visibility_from(self._keep, "value")
 
     def _require_key(self) -> None:
         """Keep the key if people get new codes, since it stores who has which code."""
@@ -232,7 +207,7 @@ class _Publishing:
                     )
             with beside(words, self._key):
                 key = self._key_path((self._key.value or "").strip()) if self._keep.value else key
-            if self._ask_again(self._name, self._key):
+            if ask_again(self.page, (self._name, self._key)):
                 return
             spec = {
                 "dataset": str(dataset),
@@ -250,14 +225,6 @@ class _Publishing:
             return self.workspace.inside(path)
         return self.workspace.new(KEYS, name)
 
-    def _ask_again(self, *fields: Field) -> bool:
-        """Move the focus to the first of ``fields`` with an error; return whether there is one."""
-        wrong = [field for field in fields if field.error]
-        if wrong:
-            focus(wrong[0])
-            self.page.say(self.words("Not yet: see what is missing beside the fields in red."), "error")
-        return bool(wrong)
-
     # Jobs -----------------------------------------------------------------------------------------------------
 
     def _progress_text(self, job: StudioJob) -> str:
@@ -273,12 +240,12 @@ class _Publishing:
         name = Path(job.spec["place"]).name
         if job.task == "publish":
             good = bool(job.result["valid"])
-            message = "The package “{name}” is made, and all validators accept it."
-            if not good:
-                message = (
-                    "The package “{name}” is made, but some validators reject it: see below. "
-                    "It was not packed as a zip."
-                )
+            message = (
+                "The package “{name}” is made, and all validators accept it."
+                if good
+                else "The package “{name}” is made, but some validators reject it: see below. It was not packed as a "
+                "zip."
+            )
             self.page.say(self.words(message, name=name), "good" if good else "error")
             if hasattr(self, "_name"):
                 self._name.set_value(self._free_name(name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -19,8 +20,8 @@ from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.record.child import CHILD, ConnectionAlert, gesture_picture, style
 from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
+from plushsense.studio.pages.record.last_recording import ResultPanel
 from plushsense.studio.pages.record.panels import SignalPanel, StepList
-from plushsense.studio.pages.record.result import ResultPanel
 
 _STATES: Texts = {
     "countdown": "GET READY",
@@ -31,21 +32,15 @@ _STATES: Texts = {
 }
 
 _MAIN: Texts = {
-    "start": "Start",
-    "cancel": "Cancel",
-    "stop": "Stop",
-    "wait": "Saving …",
-    "resume": "Continue",
-    "end": "End the session",
-    "reopen": "Open it again",
+    "idle": "Start",
+    "countdown": "Cancel",
+    "recording": "Stop",
+    "saving": "Saving …",
+    "paused": "Continue",
+    "finished": "End the session",
+    "stopped": "Open it again",
 }
-
-_SMALL: Texts = {
-    "redo": "Record the last one again",
-    "skip": "Skip",
-    "back": "Back",
-    "pause": "Pause",
-}
+"""Text of the large button in each state."""
 
 _NOTICES: Texts = {
     "no_consent": "There is no consent number. The recordings are marked, and publishing will refuse them.",
@@ -71,11 +66,8 @@ def collect(page: Page, folder: Path) -> None:
         if job.state == DONE:
             ui.navigate.to(address("review", dataset=place))
         elif job.state != RUNNING:
-            page.say(
-                words.failure(job.refusal)
-                or words("The recordings were not put into a data set: try it again on the home page."),
-                "error",
-            )
+            stopped = words("The recordings were not put into a data set: try it again on the home page.")
+            page.say(words.failure(job.refusal) or stopped, "error")
 
     on_change(jobs.changed, follow)
 
@@ -158,9 +150,8 @@ class _View:
         words, head = page.words, session.head
         self._keys = Keys(_KEYS, self._key_pressed, {"n": '[name="note"]'}, _ALIASES)
         with ui.row().classes("w-full items-center").style("gap: 2px 16px"):
-            ui.label(words("{subject}, session {session}", subject=head.subject, session=head.session)).classes(
-                "text-bold"
-            )
+            text = words("{subject}, session {session}", subject=head.subject, session=head.session)
+            ui.label(text).classes("text-bold")
             title = words(PROTOCOLS.get(head.protocol["name"], head.protocol["title"]))
             ui.label(title).classes("ps-dim")
             if head.simulated:
@@ -180,16 +171,13 @@ class _View:
         with ui.row().classes("w-full items-center"):
             self._sounds = Sounds(words, session)
             child = address("record", session=session.name, view=CHILD)
-            tag(
-                ui.link(words("Screen for the child (new window)"), child, new_tab=True).classes("ps-link"),
-                "child-link",
-            )
-        ui.label(
-            words(
-                "Keys: space (or Page Down or Enter: a clicker or a pedal) starts and stops, r (or Page Up) makes "
-                "the last one again, s skips, b goes back, p pauses, n writes a note"
-            )
-        ).classes("ps-dim")
+            link = ui.link(words("Screen for the child (new window)"), child, new_tab=True)
+            tag(link.classes("ps-link"), "child-link")
+        keys = words(
+            "Keys: space (or Page Down or Enter: a clicker or a pedal) starts and stops, r (or Page Up) makes the last "
+            "one again, s skips, b goes back, p pauses, n writes a note"
+        )
+        ui.label(keys).classes("ps-dim")
 
     def _progress_row(self) -> None:
         with ui.column().classes("w-full").style("gap: 4px"):
@@ -201,10 +189,8 @@ class _View:
     def _notices(self) -> None:
         words = self._page.words
         notices = [words(_NOTICES[key]) for key in self._session.notices]
-        notices += [
-            words("Repaired after a crash: {what}.", what=words.sentence(repair)) for repair in self._session.repairs
-        ]
-        for text in notices:
+        repairs = map(words.sentence, self._session.repairs)
+        for text in (*notices, *(words("Repaired after a crash: {what}.", what=repair) for repair in repairs)):
             box = ui.row().classes("ps-message ps-message-warning w-full").props('role="status"')
             with tag(box, "notice"):
                 ui.label(f"⚠ {text}")
@@ -235,8 +221,9 @@ class _View:
             self._main = button("main", "", look="unelevated", color=None).classes("ps-main-button")
             on_click(self._main, self._main_clicked, once=True)
             self._small: dict[str, ui.button] = {}
-            for key, name in {"r": "redo", "s": "skip", "b": "back", "p": "pause"}.items():
-                self._small[key] = button(name, words(_SMALL[name])).style("min-height: 48px")
+            texts = words.each("Record the last one again", "Skip", "Back", "Pause")
+            for key, name, text in zip("rsbp", ("redo", "skip", "back", "pause"), texts, strict=True):
+                self._small[key] = button(name, text).style("min-height: 48px")
                 on_click(self._small[key], partial(self._press, key))
             self._change_toy = button("change-toy", words("Another toy"), self._ask_toy, "flat")
             # The space bar must not start a recording where it seems to press this button.
@@ -246,16 +233,15 @@ class _View:
         ending = ui.row().classes("ps-message ps-message-warning w-full items-center").props("data-own-keys")
         with tag(ending, "ending") as self._ending:
             self._end_text = ui.label().classes("flex-grow")
-            button("end-yes", words("End it"), self._end, "unelevated", color="deep-orange-10")
+            button("end-yes", words("End it"), lambda: self._end(), "unelevated", color="deep-orange-10")
             self._no = button("end-no", words("Stay"), self._stay, color=None)
         exchange = ui.row().classes("ps-card w-full items-start").props("data-own-keys")
         with tag(exchange, "exchange") as self._exchange:
-            ui.label(
-                words(
-                    "The session goes on with another toy of the same sensor layout. It is tried first. Everything "
-                    "recorded is kept."
-                )
-            ).classes("w-full")
+            about = words(
+                "The session goes on with another toy of the same sensor layout. It is tried first. Everything "
+                "recorded is kept."
+            )
+            ui.label(about).classes("w-full")
             urls = list(dict.fromkeys([*self._controller.toys(), self._session.request.device]))
             self._toy = ToyChoice(self._page, urls, "exchange-")
             self._go_on = button("exchange-go", words("Go on with this toy"), self._exchange_toy, "unelevated")
@@ -290,16 +276,10 @@ class _View:
 
     def _press(self, key: str, seen: str) -> None:
         with self._page.show_errors():
-            if self._session.press(key, seen):
-                self._page.say("")
-            else:
-                self._page.say(
-                    self._page.words(
-                        "The press came too late: the state had changed already. Look, and press again if you still "
-                        "want to."
-                    ),
-                    "warning",
-                )
+            late = self._page.words(
+                "The press came too late: the state had changed already. Look, and press again if you still want to."
+            )
+            self._page.say("" if self._session.press(key, seen) else late, "warning")
         self.draw()
 
     async def _main_clicked(self, seen: str) -> None:
@@ -349,22 +329,21 @@ class _View:
         finally:
             self._go_on.enable()
 
-    async def _end(self) -> None:
+    async def _end(self, then: Callable[[], None] | None = None) -> None:
+        """End the session, and call ``then``, by default to go to the start page."""
         self._left = True
         with self._page.show_errors():
             await run.io_bound(self._controller.close_session, self._session.name)
-            ui.navigate.to(address("record", ended=self._session.name))
+            if then is None:
+                ui.navigate.to(address("record", ended=self._session.name))
+            else:
+                then()
             return
         self._left = False
 
     async def _collect(self) -> None:
         """End the session, and lead to its recordings."""
-        self._left = True
-        with self._page.show_errors():
-            await run.io_bound(self._controller.close_session, self._session.name)
-            collect(self._page, self._session.recorder.session.folder)
-            return
-        self._left = False
+        await self._end(partial(collect, self._page, self._session.recorder.session.folder))
 
     async def _reopen(self) -> None:
         """Resume the session; if that fails, let the button lead to the start page to choose another toy."""
@@ -441,9 +420,8 @@ class _View:
     def _lost_text(self, s: RecorderStatus) -> str:
         """Return what to display if the connection is lost: what is kept, and what must be made again."""
         words = self._page.words
-        texts = [
-            words("CONNECTION LOST, NOT RECORDING. Kept: {done} of {steps} recordings.", done=s.done, steps=s.steps)
-        ]
+        kept = {"done": s.done, "steps": s.steps}
+        texts = [words("CONNECTION LOST, NOT RECORDING. Kept: {done} of {steps} recordings.", **kept)]
         if s.state in ("countdown", "recording"):
             gesture, repetition = words.gesture(s.step.gesture), self._repetition.text
             texts.append(words("To be made again: {gesture}, {repetition}.", gesture=gesture, repetition=repetition))
@@ -464,9 +442,7 @@ class _View:
         self._alert.prepare(self._lost_text(s))
         self._box.style(f"background: {colour}")
         self._box.props(f'data-state="{state}"')
-        main = {"idle": "start", "countdown": "cancel", "recording": "stop", "saving": "wait", "paused": "resume"}
-        main |= {"finished": "end", "stopped": "reopen"}
-        self._main.text = words(_MAIN[main[state]])
+        self._main.text = words(_MAIN[state])
         self._main.style(f"background: {colour} !important; color: #fff !important")
         self._small["r"].text = words(
             "Discard and record again" if state == "recording" else "Record the last one again"
@@ -481,13 +457,14 @@ class _View:
         # When everything is recorded, the main button ends the session.
         self._end_button.set_visibility(state != "finished")
         if state == "finished":
-            folder = str(self._session.recorder.session.folder.relative_to(self._page.workspace.folder))
-            counts = {"done": s.done, "skipped": s.skipped, "redone": s.redone}
+            folder = self._session.recorder.session.folder.relative_to(self._page.workspace.folder)
             self._done_text.text = words(
                 "All done: {done} recorded, {skipped} skipped, {redone} recorded again. The recordings are in "
                 "{folder}.",
-                folder=folder,
-                **counts,
+                folder=str(folder),
+                done=s.done,
+                skipped=s.skipped,
+                redone=s.redone,
             )
         self._done.set_visibility(state == "finished")
         step = f"{words.gesture(s.step.gesture)}, {self._repetition.text}. {s.step.prompt}. "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +15,20 @@ from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
 from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
-from plushsense.studio.app.toys import Toys
+from plushsense.studio.app.toys import Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
-from plushsense.studio.app.workspace import VIRTUAL, Workspace
-from plushsense.studio.pages.live import adapting_page, validation_page
+from plushsense.studio.app.workspace import VIRTUAL
+from plushsense.studio.pages.live import adapting, validation_page
+from plushsense.studio.pages.live.event_log import LogButtons
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
-from plushsense.studio.pages.live.log import LogButtons
+from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
-from plushsense.studio.pages.live.state import LiveChoice
-from plushsense.studio.widgets.elements import style, summary
+from plushsense.studio.widgets.elements import notice, style, summary
 
 _REACTIONS: Texts = {
     "standard": "green, or red if rough",
     "gentle": "green, or dark if rough",
-}
-
-_RATES: Texts = {
-    "decision": "Show the decision",
-    "plot": "Draw the signals",
 }
 
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
@@ -46,22 +42,17 @@ def show(page: Page) -> None:
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
         _Controls(page, reader, feed)
-    simulated = tag(
-        ui.label(words("Simulation: these data say nothing about a real toy.")).classes(
-            "ps-message ps-message-warning w-full"
-        ),
-        "simulation",
-    )
+    simulated = tag(notice(words("Simulation: these data say nothing about a real toy.")), "simulation")
 
     def update_mark() -> None:
         simulated.set_visibility(reader.device is not None and reader.choice.simulated)
 
     on_change(reader.changed, update_mark)
     update_mark()
-    view, people = LiveView(words, feed), adapting_page.PersonFields(page, reader)
+    view, people = LiveView(words, feed), adapting.PersonFields(page, reader)
     with view:
         _person_panel(page, reader)
-        adapting_page.show(page, people)
+        adapting.show(page, people)
     with view.add_slot("log"):
         log = LogButtons(page, reader)
     follow(view, feed, reader)
@@ -97,9 +88,8 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
         buttons.clear()
         with buttons:
             for label in now:
-                button(
-                    f"do-{label}", words.gesture(label), lambda label=label: direct(label), 'outline padding="3px 8px"'
-                ).classes("ps-note")
+                make, look = partial(direct, label), 'outline padding="3px 8px"'
+                button(f"do-{label}", words.gesture(label), make, look).classes("ps-note")
             button("do-nothing", words("Stop"), lambda: direct(""), "outline dense", icon="stop").classes("ps-note")
             button("do-own", words("By themselves"), lambda: direct(None), "flat dense").classes("ps-note")
 
@@ -136,8 +126,8 @@ class _Controls:
                 tag(self._reactions, "reactions")
                 engines = {"float": words("as trained (float)"), "int8": words("as on the chip (int8)")}
                 self._engine = tag(ui.select(engines, value=choice.engine, label=words("Arithmetic")), "engine")
-                self._add_rate("decision", RATES_HZ[-1], lambda pace_s: setattr(feed, "decision_s", pace_s))
-                self._add_rate("plot", PLOT_HZ, lambda pace_s: setattr(feed, "plot_s", pace_s))
+                self._add_rate("decision", words("Show the decision"), RATES_HZ[-1])
+                self._add_rate("plot", words("Draw the signals"), PLOT_HZ)
             self._rates = ui.label("").classes("ps-dim ps-note")
             with ui.row().classes("w-full items-center ps-small-gap"):
                 self._look = button("look", words("Look for toys"), self._toys.search, "flat", icon="search")
@@ -154,17 +144,21 @@ class _Controls:
     def _add_toy(self, label: str) -> None:
         reader, workspace = self._reader, self._workspace
         first = reader.choice.toy if reader.now.running else workspace.toy or VIRTUAL
-        options = _toy_options(self._toys, workspace, first)
-        self._toy = ui.select(options, value=first, label=label, with_input=True, new_value_mode="add-unique")
+        self._toy = ui.select(
+            self._toy_options(first), value=first, label=label, with_input=True, new_value_mode="add-unique"
+        )
         tag(self._toy.props(f'hint="{self._page.words("Choose, or type an address and press Enter")}"'), "toy")
 
-    def _add_rate(self, name: str, usual: int, choose: Callable[[float], None]) -> None:
+    def _add_rate(self, name: str, label: str, usual: int) -> None:
         """Add the choice of a rate at which this page displays something; ``usual`` is chosen at first."""
-        words = self._page.words
-        most = RATES_HZ[-1]
+        words, most = self._page.words, RATES_HZ[-1]
         rates = {n: words("{n} times a second", n=n) if n > 1 else words("once a second") for n in RATES_HZ[::-1]}
-        field = ui.select(rates, value=usual, label=words(_RATES[name]))
-        tag(field, f"rate-{name}").on_value_change(lambda e: choose(PACE_S if e.value == most else 1.0 / e.value))
+
+        def choose(rate: int) -> None:
+            setattr(self._feed, f"{name}_s", PACE_S if rate == most else 1.0 / rate)
+
+        field = ui.select(rates, value=usual, label=label)
+        tag(field, f"rate-{name}").on_value_change(lambda e: choose(e.value))
 
     async def _run(self, command: Callable[..., None], *args: Any) -> bool:
         """Run ``command`` in a thread, show its errors beside the field, and return whether it succeeded."""
@@ -219,7 +213,7 @@ class _Controls:
         self._engine.set_value(now.engine)
         self._reactions.set_value(now.reactions)
         if self._reader.now.running:
-            self._toy.set_options(_toy_options(self._toys, self._workspace, now.toy), value=now.toy)
+            self._toy.set_options(self._toy_options(now.toy), value=now.toy)
             self._simulated.set_value(now.simulated)
 
     def _update(self) -> None:
@@ -239,20 +233,19 @@ class _Controls:
         now = f": {choice.toy} · {choice.bundle.stem}" if running and choice.bundle is not None else ""
         self._title.set_content(words("Toy, network and settings") + now)
         step_s = reader.bundle.arch.step * reader.bundle.layout.period_us / 1e6 if reader.bundle is not None else 0.05
-        self._rates.set_text(
-            words(
-                "These two change only this page. The network itself answers {n} times a second, and neither events "
-                "nor reactions wait for the page.",
-                n=words.number(1.0 / step_s),
-            )
+        rates = words(
+            "These two change only this page. The network itself answers {n} times a second, and neither events nor "
+            "reactions wait for the page.",
+            n=words.number(1.0 / step_s),
         )
+        self._rates.set_text(rates)
         self._follow()
 
     def _update_toys(self) -> None:
         self._busy.set_visibility(self._toys.searching)
         if not self._reader.now.running:
             value = self._toy.value
-            self._toy.set_options(_toy_options(self._toys, self._workspace, str(value or "")), value=value)
+            self._toy.set_options(self._toy_options(str(value or "")), value=value)
 
     def _update_simulated(self) -> None:
         self._toy.error = None
@@ -260,8 +253,9 @@ class _Controls:
             with contextlib.suppress(PlushSenseError):
                 self._simulated.set_value(is_virtual(str(self._toy.value or "")))
 
-
-def _toy_options(toys: Toys, workspace: Workspace, url: str) -> dict[str, str]:
-    """Return the toys to choose from (URL to text): ``url``, those given at start, the virtual one and those found."""
-    known = {one: one for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
-    return known | {d.url: f"{d.name or d.url}: {d.description}" for d in toys.listing.devices}
+    def _toy_options(self, url: str) -> dict[str, str]:
+        """Return the toys to choose from: ``url``, those given at start, the virtual one and those found."""
+        words, workspace = self._page.words, self._workspace
+        known = {one: toy_title(words, one) for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
+        found = [d for d in self._toys.listing.devices if d.kind != "virtual"]
+        return known | {d.url: f"{d.name or d.url}: {described(words, d)}" for d in found}

@@ -45,33 +45,6 @@ _NEXT_STEPS: Texts = {
     "read": "README.md in the export describes how to pass frames, what is returned, and what is required.",
 }
 
-_HEADS: Texts = {
-    "target": "Target",
-    "compiler": "Compiler",
-    "flags": "Flags",
-    "answers": "Answers",
-    "mismatches": "Different",
-    "difference": "Largest difference",
-    "verdict": "Verdict",
-    "stream": "Input",
-    "samples": "Samples",
-    "frames": "Frames",
-    "chip": "Chip",
-    "mhz": "MHz",
-    "estimate": "ms per step, estimated",
-    "fits": "In time?",
-    "counted_on": "Measured on",
-    "instructions": "Instructions per step",
-    "flash_all": "Flash with code (bytes)",
-    "ram_all": "RAM (bytes)",
-    "stack": "Stack (bytes)",
-    "name": "Name",
-    "network": "Network structure",
-    "data": "Data",
-    "made": "Created",
-    "last_proof": "Last verification",
-}
-
 _STAGES: Texts = {
     "begin": "Starting …",
     "export": "Writing the C and the golden vectors …",
@@ -80,12 +53,7 @@ _STAGES: Texts = {
     "verify": "Compiling and running …",
 }
 
-_FITS_TEXTS: Texts = {
-    "yes": "yes",
-    "no": "no",
-    "unsure": "not sure",
-}
-
+_FITS_TEXTS: Texts = {"yes": "yes", "no": "no", "unsure": "not sure"}
 _FITS = {"yes": True, "no": False, "unsure": None}
 
 
@@ -113,14 +81,12 @@ def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJ
 
 
 def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
-    text(
-        words(
-            "An answer is due every {step} ms. Instructions are counted exactly, on emulators. Times are estimated "
-            "from them, as a lower and an upper bound: nothing was measured on a real chip.",
-            step=words.significant(profile["step_ms"], 3),
-        ),
-        classes="ps-dim",
+    about = words(
+        "An answer is due every {step} ms. Instructions are counted exactly, on emulators. Times are estimated from "
+        "them, as a lower and an upper bound: nothing was measured on a real chip.",
+        step=words.significant(profile["step_ms"], 3),
     )
+    text(about, classes="ps-dim")
     rows = [
         (
             each["chip"],
@@ -131,7 +97,7 @@ def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
         for each in profile["estimated_ms"].values()
     ]
     if rows:
-        head = [words(_HEADS[k]) for k in ("chip", "mhz", "estimate", "fits")]
+        head = words.each("Chip", "MHz", "ms per step, estimated", "In time?")
         tag(table(words("Estimated time of a step on real chips, {when}", when=when), head, rows, (1,)), "estimates")
     counted = [
         (
@@ -143,13 +109,11 @@ def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
         if each["instructions_per_step"] is not None
     ]
     if counted:
-        head = [words(_HEADS[k]) for k in ("counted_on", "instructions", "flash_all", "ram_all", "stack")]
-        table(
-            words("Measured on emulators, compiled with {optimise}", optimise=profile["optimise"]),
-            head,
-            counted,
-            (1, 2, 3, 4),
+        head = words.each(
+            "Measured on", "Instructions per step", "Flash with code (bytes)", "RAM (bytes)", "Stack (bytes)"
         )
+        caption = words("Measured on emulators, compiled with {optimise}", optimise=profile["optimise"])
+        table(caption, head, counted, (1, 2, 3, 4))
     for name, packages in profile["missing"].items():
         text(_missing_target(words, TARGETS[name].title, packages), classes="ps-dim")
 
@@ -261,14 +225,12 @@ class VerificationCard:
         missing = await run.io_bound(targets) or {}
         with tag(ui.column().classes("ps-card w-full"), "proof"):
             text(words(in_context("heading", "Verify")), "h3")
-            text(
-                words(
-                    "The C code in this folder is compiled and run if it is exactly what this version of PlushSense "
-                    "writes for the network. Each answer is compared with that of the exact network, also in test "
-                    "scenarios, which use the same network with other decision rules."
-                ),
-                classes="ps-dim",
+            about = words(
+                "The C code in this folder is compiled and run if it is exactly what this version of PlushSense writes "
+                "for the network. Each answer is compared with that of the exact network, also in test scenarios, "
+                "which use the same network with other decision rules."
             )
+            text(about, classes="ps-dim")
             with ui.expansion(words("More settings")).classes("w-full"):
                 with ui.row().classes("w-full"):
                     for name in (n for n, packages in missing.items() if not packages):
@@ -284,15 +246,11 @@ class VerificationCard:
                 self._dataset = ui.select(options, value="", label=words("Also stream the recordings of")).classes(
                     "w-full"
                 )
-                self._trust = tag(
-                    ui.checkbox(
-                        words(
-                            "Also compile and run C files that were changed or come from elsewhere (they can do "
-                            "anything on this computer that you can do)"
-                        )
-                    ),
-                    "trust",
+                trust = words(
+                    "Also compile and run C files that were changed or come from elsewhere (they can do anything on "
+                    "this computer that you can do)"
                 )
+                self._trust = tag(ui.checkbox(trust), "trust")
             start = button("verify", words("Verify"), self._start, "", icon="fact_check")
             start.set_enabled(bool(self._chosen))
             proof = newest_job(self.page.workspace.part(Jobs), "verify", self.export.folder)
@@ -325,13 +283,8 @@ class VerificationCard:
         words, result = self.words, proof.result
         with tag(ui.column().classes("w-full"), "verdict"):
             if result["digest"] != self.export.digest:
-                text(
-                    words(
-                        "The files have changed since this verification of {when}. Verify again.",
-                        when=moment(proof.ended_s),
-                    ),
-                    classes="ps-message ps-message-warning w-full",
-                )
+                when = moment(proof.ended_s)
+                notice(words("The files have changed since this verification of {when}. Verify again.", when=when))
             good, outcome = _outcome(words, result)
             with ui.row().classes("items-center"):
                 html(verdict(good, outcome))
@@ -350,29 +303,19 @@ class VerificationCard:
                 )
                 for r in result["runs"]
             ]
-            keys = ("target", "compiler", "flags", "answers", "mismatches", "difference", "verdict")
             caption = words("Compiled and run programs, {when}", when=moment(proof.ended_s))
-            tag(table(caption, [words(_HEADS[k]) for k in keys], rows, (3, 4, 5)), "runs")
+            head = words.each("Target", "Compiler", "Flags", "Answers", "Different", "Largest difference", "Verdict")
+            tag(table(caption, head, rows, (3, 4, 5)), "runs")
             counts = ("samples", "frames", "answers")
             streams = [(s["name"], *(words.count(s[key]) for key in counts)) for s in result["streams"]]
-            head = [words(_HEADS[k]) for k in ("stream", *counts)]
-            tag(
-                table(
-                    words(
-                        "Inputs of each program (scenario: the network with other rules; golden: the vectors of the "
-                        "export)"
-                    ),
-                    head,
-                    streams,
-                    (1, 2, 3),
-                ),
-                "streams",
+            caption = words(
+                "Inputs of each program (scenario: the network with other rules; golden: the vectors of the export)"
             )
+            head = words.each("Input", "Samples", "Frames", "Answers")
+            tag(table(caption, head, streams, (1, 2, 3)), "streams")
             for each in result["not_run"]:
-                text(
-                    words("Not run: {what} ({why}).", what=each["what"], why=words.sentence(each["why"])),
-                    classes="ps-dim",
-                )
+                why = words.sentence(each["why"])
+                text(words("Not run: {what} ({why}).", what=each["what"], why=why), classes="ps-dim")
 
     def _sum(self, result: dict[str, Any]) -> str:
         total, unequal = self.words.count(result["vectors"]), self.words.count(result["mismatches"])
@@ -395,15 +338,13 @@ class VerificationCard:
                 words("Nothing is verified: in no answer had the toy finished warming up. Export the network again.")
             )
         if not result["own"]:
-            sentences.append(
+            sentences += [
                 words(
                     "The code in this folder is not what this version of PlushSense writes for the .plush file in "
                     "it. Equal answers say nothing about what else it does. Export again to be sure."
-                )
-            )
-            sentences.append(
-                words("These files are not what PlushSense writes: {files}", files=", ".join(result["changed"]))
-            )
+                ),
+                words("These files are not what PlushSense writes: {files}", files=", ".join(result["changed"])),
+            ]
         return sentences
 
 
@@ -424,13 +365,11 @@ class _Exporting:
 
     async def build(self) -> None:
         style()
-        text(
-            self.words(
-                "Put a trained network into a toy: the studio writes a folder for the person who programs the toy. "
-                "Everything stays on this computer."
-            ),
-            classes="ps-dim",
+        about = self.words(
+            "Put a trained network into a toy: the studio writes a folder for the person who programs the toy. "
+            "Everything stays on this computer."
         )
+        text(about, classes="ps-dim")
         await self._form()
         self.work = WorkPanel(self.page, _TASKS, self._progress_text, self._ended, self._allow)
         self._allow()
@@ -474,25 +413,19 @@ class _Exporting:
         extras = await run.io_bound(formats) or {}
         self._formats: dict[str, ui.checkbox] = {}
         text(words("Also for other runtimes"), "h3")
-        text(
-            words(
-                "These formats compute a whole window for each answer. Each is tested in its own runtime before it "
-                "is written."
-            ),
-            classes="ps-dim",
+        about = words(
+            "These formats compute a whole window for each answer. Each is tested in its own runtime before it is "
+            "written."
         )
+        text(about, classes="ps-dim")
         for name in (n for n, extra in extras.items() if not extra):
             self._formats[name] = tag(ui.checkbox(f"{name}: {CONVERTERS[name].holds}"), f"format-{name}")
         for extra in dict.fromkeys(e for e in extras.values() if e):
             missing = ", ".join(n for n, needed in extras.items() if needed == extra)
-            text(
-                words(
-                    "Not installed: {names}. Install with  pip install 'plushsense[{extra}]'",
-                    names=missing,
-                    extra=extra,
-                ),
-                classes="ps-dim",
+            about = words(
+                "Not installed: {names}. Install with  pip install 'plushsense[{extra}]'", names=missing, extra=extra
             )
+            text(about, classes="ps-dim")
         text(words("Calibration for 8 bits"), "h3")
         options = {"": words("From training, as stored in the network")} | await titles(self.workspace)
         self._dataset = ui.select(options, value="", label=words("Data set for the calibration")).classes("w-full")
@@ -638,5 +571,5 @@ class _Exporting:
             if not rows:
                 text(words("There are no exports yet."), classes="ps-dim")
                 return
-            keys = ("name", "network", "data", "made", "last_proof")
-            table(words("Exports of this studio, the newest first"), [words(_HEADS[k]) for k in keys], rows)
+            head = words.each("Name", "Network structure", "Data", "Created", "Last verification")
+            table(words("Exports of this studio, the newest first"), head, rows)

@@ -87,16 +87,6 @@ class EventSpan:
 
 
 @dataclass(frozen=True)
-class Performed:
-    """A gesture that the virtual person really makes, in seconds as in `EventSpan`; numbered from 1."""
-
-    number: int
-    label: str
-    begin_s: float
-    end_s: float
-
-
-@dataclass(frozen=True)
 class Situation:
     """Present state of toy and touch, computed once for everything that is displayed, announced and drawn.
 

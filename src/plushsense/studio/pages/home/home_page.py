@@ -12,7 +12,7 @@ from plushsense.studio.app.jobs import RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, button, html, named, on_change, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import DATASETS, WORK
+from plushsense.studio.app.workspace import DATASETS, VIRTUAL, WORK
 from plushsense.studio.pages.home.datasets import DatasetSection
 from plushsense.studio.pages.home.incoming import IncomingSection
 from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
@@ -93,12 +93,11 @@ def invitation(page: Page) -> None:
         return
     words = page.words
     with titled_card(page, "Connect another device", "invite"):
-        ui.label(
-            words(
-                "A tablet or another computer needs its own address, which can be opened once. Scan the code with "
-                "its camera, or type the address."
-            )
-        ).classes("ps-dim")
+        about = words(
+            "A tablet or another computer needs its own address, which can be opened once. Scan the code with its "
+            "camera, or type the address."
+        )
+        ui.label(about).classes("ps-dim")
         place = ui.column().classes("w-full").props('aria-live="polite"')
 
         def show() -> None:
@@ -118,18 +117,7 @@ def invitation(page: Page) -> None:
 
 
 MAKING = ("simulate", "import", "restore")
-CHANGING = (
-    *MAKING,
-    "backup",
-    "restore",
-    "forget",
-    "check",
-    "train",
-    "sweep",
-    "search",
-    "export",
-    "publish",
-)
+CHANGING = (*MAKING, "backup", "forget", "check", "train", "sweep", "search", "export", "publish")
 # Enough data to train a network, but simulated within seconds.
 _PEOPLE, _REPETITIONS = 6, 2
 
@@ -155,11 +143,8 @@ async def show(page: Page) -> None:
             invitation(page)
 
     def fill(now: WorkspaceSummary) -> None:
-        step.fill(now)
-        datasets.fill(now)
-        sessions.fill(now)
-        networks(now)
-        discarded.fill(now.discarded)
+        for part in (step.fill, datasets.fill, sessions.fill, networks, discarded.fill):
+            part(now)
 
     async def refresh() -> None:
         now = await run.io_bound(overview.look)
@@ -240,7 +225,7 @@ class NextStepCard:
         workspace = self._page.workspace
         with self._page.show_errors():
             if not workspace.toy:
-                self._toys.person(7)
+                self._toys.choose(VIRTUAL)
             name = workspace.free_name(DATASETS, self._page.words("virtual toy"), separator=" ")
             spec = {
                 "people": _PEOPLE,

@@ -15,8 +15,8 @@ from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, add_style, button, focus, html, on_change, query_path, section, tag
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.jobs import JobsSection, warning_texts
-from plushsense.studio.pages.train.requests import (
+from plushsense.studio.pages.train.job_cards import JobsSection, warning_texts
+from plushsense.studio.pages.train.job_requests import (
     BUILT_IN,
     EVALUATE,
     KINDS,
@@ -31,8 +31,14 @@ from plushsense.studio.pages.train.requests import (
     grids,
     job_request,
 )
-from plushsense.studio.pages.train.results import StoredResults, counted, duration_text, score_labels, whole
 from plushsense.studio.pages.train.results_section import ResultsSection
+from plushsense.studio.pages.train.stored_results import (
+    StoredResults,
+    counted,
+    duration_text,
+    leaky_warning,
+    score_labels,
+)
 from plushsense.studio.pages.train.verdict import FEW_PEOPLE
 from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, scroll_to
 from plushsense.training.spec import DEVICES, PRESETS
@@ -171,9 +177,8 @@ class TrainingForm:
                 ui.label(w("There is no data set yet. Record a session, or import recordings on the home page."))
                 return
             self._usual_fields()
-            with tag(
-                ui.expansion(w("More settings and other jobs"), icon="tune").classes("w-full"), "more"
-            ) as self._more:
+            self._more = ui.expansion(w("More settings and other jobs"), icon="tune").classes("w-full")
+            with tag(self._more, "more"):
                 kinds = {kind: w(KINDS_OF_TRAINING[kind]) for kind in KINDS}
                 radio = ui.radio(kinds, value=self._kind, on_change=self._choose_kind).props("inline")
                 tag(radio, "kind").props(f'aria-label="{w("What to do")}"')
@@ -184,12 +189,11 @@ class TrainingForm:
 
     def _usual_fields(self) -> None:
         w = self._words
-        ui.label(
-            w(
-                "Choose the data set and press the button. The network is trained for live use, then tested on "
-                "people that it never met."
-            )
+        about = w(
+            "Choose the data set and press the button. The network is trained for live use, then tested on people that "
+            "it never met."
         )
+        ui.label(about)
         with ui.row().classes("w-full items-start"):
             box = ui.select(self._datasets, label=w("Data set"), value=self._dataset, on_change=self._choose_dataset)
             self._usual["dataset"] = tag(box.classes(_FIELD), "dataset")
@@ -228,10 +232,9 @@ class TrainingForm:
             if not facts.streams and self._values[TRAIN]["context"] == ANYWHERE:
                 self._values[TRAIN]["context"] = "loop"
                 self._build()
+                none = w("This data set has no continuous sessions, so the network learns from repeated gestures.")
                 with self._facts:
-                    ui.label(
-                        w("This data set has no continuous sessions, so the network learns from repeated gestures.")
-                    ).classes("ps-dim")
+                    ui.label(none).classes("ps-dim")
 
     async def _choose_dataset(self, event: Any) -> None:
         self._dataset = str(event.value)
@@ -326,12 +329,7 @@ class TrainingForm:
         with self._split_row:
             if parse_split(split).leaky:
                 html(score_labels(self._words, True, False))
-                ui.label(
-                    self._words(
-                        "Leaky: parts of one recording are on both sides of this split, so the score is too good. "
-                        "Never report it as the score for new people."
-                    )
-                )
+                ui.label(leaky_warning(self._words))
             elif split.startswith("by-recording"):
                 ui.label(self._words("The network knows these people: expect lower scores for new people."))
 
@@ -421,9 +419,8 @@ class TrainingForm:
 
     def _begin(self, request: JobRequest) -> None:
         self._jobs.start(request.task, request.spec, request.title)
-        self._page.say(
-            self._words("The work has begun: its progress is under “Jobs” below. You may close this page."), "good"
-        )
+        begun = self._words("The work has begun: its progress is under “Jobs” below. You may close this page.")
+        self._page.say(begun, "good")
         scroll_to("job")
 
     def _estimate(self) -> None:
@@ -431,7 +428,7 @@ class TrainingForm:
         self.close()
         with self._show_errors():
             request = self._estimate_request = self._request()
-            self._estimate_job = self._jobs.start(request.task, request.dry, request.title)
+            self._estimate_job = self._jobs.start(request.task, request.spec | {"dry": True}, request.title)
             self._plan.clear()
             with self._plan, ui.row().classes("items-center"):
                 ui.spinner(size="sm")
@@ -442,14 +439,9 @@ class TrainingForm:
         with self._show_errors():
             request = self._request()
             if request.task in (SWEEP, SEARCH) and self._estimated != request.key:
-                self._page.say(
-                    self._words(
-                        "The settings have changed since then. Estimate again."
-                        if self._estimated
-                        else "Look at the cost first: press “How long will it take?”, then start."
-                    ),
-                    "warning",
-                )
+                changed = self._words("The settings have changed since then. Estimate again.")
+                first = self._words("Look at the cost first: press “How long will it take?”, then start.")
+                self._page.say(changed if self._estimated else first, "warning")
                 return
             self._begin(request)
             self._estimated = ""
@@ -504,7 +496,7 @@ class TrainingForm:
                 gestures=counted(w, "gestures", plan["classes"]),
                 trainings=counted(w, "networks", plan["folds"]),
                 epochs=counted(w, "epochs", plan["epochs"]),
-                **{key: whole(w, plan[key]) for key in ("windows", "parameters")},
+                **{key: w.count(plan[key]) for key in ("windows", "parameters")},
                 macs=_power(w, plan["macs"]),
             )
         elif task == SWEEP:
@@ -527,24 +519,19 @@ class TrainingForm:
                 macs=_power(w, plan["halving"]["bound_macs"]),
             )
         tag(ui.label(text), "plan-text")
-        tag(
-            ui.label(
-                w(
-                    "This takes {time} on this computer, as measured just now. Reading the data and fitting "
-                    "decisions take additional time.",
-                    time=duration_text(w, plan["seconds"]),
-                )
-            ),
-            "plan-time",
+        text = w(
+            "This takes {time} on this computer, as measured just now. Reading the data and fitting decisions take "
+            "additional time.",
+            time=duration_text(w, plan["seconds"]),
         )
+        tag(ui.label(text), "plan-time")
 
 
 def _power(words: Words, value: float) -> str:
     """Format a number in scientific notation, as in ``2.3·10¹²``."""
     digits, power = f"{value:.1e}".split("e")
-    return (
-        f"{words.number(float(digits), 1)}·10{str(int(power)).translate(str.maketrans('0123456789-', '⁰¹²³⁴⁵⁶⁷⁸⁹⁻'))}"
-    )
+    raised = str(int(power)).translate(str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"))
+    return f"{words.number(float(digits), 1)}·10{raised}"
 
 
 def _integer(text: Any) -> Any:
@@ -566,12 +553,11 @@ async def show(page: Page) -> None:
     """Build the page."""
     add_style(_CSS.read_text(encoding="utf-8"))
     jobs, results = page.workspace.part(Jobs), page.workspace.part(StoredResults)
-    ui.label(
-        page.words(
-            "A network learns from recordings to tell gestures apart. Here you train networks, test them on new "
-            "people, and compare them."
-        )
-    ).classes("ps-dim")
+    about = page.words(
+        "A network learns from recordings to tell gestures apart. Here you train networks, test them on new people, "
+        "and compare them."
+    )
+    ui.label(about).classes("ps-dim")
     rows = await run.io_bound(results.rows)
     form = TrainingForm(page, jobs, results)
     job_list = JobsSection(page, jobs, results, lambda identity: table.open(identity))

@@ -14,29 +14,13 @@ from plushsense.core.errors import AddressError, ConfigError, DeviceError, Layou
 from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary
 from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
+from plushsense.studio.app.toys import toy_title
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import CHILD, show_child
-from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice, toy_name
+from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
-from plushsense.studio.pages.record.session import collect, show_session
+from plushsense.studio.pages.record.session_page import collect, show_session
 from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
-
-_LABELS: Texts = {
-    "code": "Code of the person",
-    "consent": "Number of the consent form",
-    "age_group": "Age group",
-    "gender": "Gender",
-    "protocol": "What to record",
-    "wording": "Wording",
-    "layout": "Sensor layout of the toy",
-}
-
-_HINTS: Texts = {
-    "code_hint": "For example S01, never a name",
-    "consent_hint": "Required for publishing",
-    "age_hint": "For example child, teen, adult",
-    "gender_hint": "In the person's own words",
-}
 
 _WORDINGS: Texts = {
     "default": "Standard, in the language of the protocol",
@@ -76,16 +60,15 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
     mine = {s.name: s for s in sessions}
     if ended in mine:
         session = mine[ended]
-        counts = {"name": ended, "done": session.done, "steps": session.steps}
-        page.say(
-            page.words(
-                "{name} is finished: {done} of {steps} recorded."
-                if session.finished
-                else "{name}: {done} of {steps} recorded. You can continue at any time.",
-                **counts,
-            ),
-            "good",
+        text = page.words(
+            "{name} is finished: {done} of {steps} recorded."
+            if session.finished
+            else "{name}: {done} of {steps} recorded. You can continue at any time.",
+            name=ended,
+            done=session.done,
+            steps=session.steps,
         )
+        page.say(text, "good")
         if session.done:
             _ended(page, session)
     elif requested in mine and not mine[requested].finished:
@@ -105,9 +88,8 @@ def _ended(page: Page, session: SessionSummary) -> None:
             collect(page, session.folder)
 
     with tag(ui.row().classes("ps-card ps-next w-full items-center"), "ended-session"):
-        ui.label(page.words("Recordings of this session: {n}. They are put into a data set.", n=session.done)).classes(
-            "flex-grow text-lg"
-        )
+        text = page.words("Recordings of this session: {n}. They are put into a data set.", n=session.done)
+        ui.label(text).classes("flex-grow text-lg")
         see = button("collect", page.words("Look at the recordings"), clicked, "unelevated size=lg", about=session.name)
 
 
@@ -151,13 +133,12 @@ class _SessionLists:
         words, name, controller = self._page.words, session.name, self._controller
         with tag(ui.row().classes("w-full items-center"), f"unfinished-{name}"):
             if session.head is None or session.protocol is None:
-                ui.label(
-                    words("The session {name} cannot be read. Restore its folder from a copy.", name=name)
-                ).classes("flex-grow")
+                text = words("The session {name} cannot be read. Restore its folder from a copy.", name=name)
+                ui.label(text).classes("flex-grow")
                 return
             self._describe(session)
             toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
-            titles = {u: toy_name(words, u) for u in toys}
+            titles = {u: toy_title(words, u) for u in toys}
             toy = ui.select(titles, value=toys[0], label=words("Toy")).style("width: 24rem; max-width: 100%")
             named(toy.props("outlined dense"), f"{words('Toy')}: {name}")
             go_on = button("", words("Continue"), None, "unelevated", about=name)
@@ -189,25 +170,23 @@ class _SessionLists:
         words, name, controller = self._page.words, session.name, self._controller
         subject, finished = session.folder.parent.name, session.finished
 
+        change = partial(change_files, self._page, refresh=self._refresh)
+
         async def finish() -> None:
             message = words(
                 "{name} can be continued again." if finished else "{name} is marked as finished.", name=name
             )
-            await self._change(
-                lambda: controller.finish(name, not finished), message, lambda _: controller.finish(name, finished)
-            )
+            undo = partial(controller.finish, name, finished)
+            await change(partial(controller.finish, name, not finished), message, undo=lambda _: undo())
 
         async def rename(code: str) -> None:
             message = words("{name} now belongs to {code}.", name=name, code=code)
-            await self._change(
-                lambda: controller.rename_person(name, code),
-                message,
-                lambda new: controller.rename_person(new, subject),
-            )
+            work = partial(controller.rename_person, name, code)
+            await change(work, message, undo=lambda new: controller.rename_person(new, subject))
 
         async def discard() -> None:
             message = words("“{name}” is discarded. It can be restored on the home page.", name=name)
-            await self._change(lambda: controller.discard(name), message, self._page.workspace.restore)
+            await change(partial(controller.discard, name), message, undo=self._page.workspace.restore)
 
         def ask_code() -> None:
             title = words("The code of the person in {name}", name=name)
@@ -219,9 +198,6 @@ class _SessionLists:
             words("Discard"): discard,
         }
         item_menu(words, name, actions)
-
-    async def _change(self, work: Callable[[], Any], message: str, undo: Callable[[Any], Any]) -> None:
-        await change_files(self._page, work, message, self._refresh, undo)
 
     async def _refresh(self) -> None:
         self.fill(await run.io_bound(self._controller.sessions) or [])
@@ -264,14 +240,16 @@ class _Form:
         with tag(ui.column().classes("ps-card w-full"), "new-session"):
             html(words("New session"), "h2")
             with ui.row().classes("w-full items-start"):
-                self._subject = self._input("code", "code_hint")
-                self._consent = self._input("consent", "consent_hint")
-                self._age = self._input("age_group", "age_hint")
-                self._gender = self._input("gender", "gender_hint")
+                code, consent = words.each("For example S01, never a name", "Required for publishing")
+                age, gender = words.each("For example child, teen, adult", "In the person's own words")
+                self._subject = _input("code", words("Code of the person"), code)
+                self._consent = _input("consent", words("Number of the consent form"), consent)
+                self._age = _input("age_group", words("Age group"), age)
+                self._gender = _input("gender", words("Gender"), gender)
             with ui.row().classes("w-full items-start"):
-                self._protocol = self._select(self._titles(), "protocol", PROTOCOL)
+                self._protocol = _select(self._titles(), "protocol", words("What to record"), PROTOCOL)
                 self._protocol.on_value_change(self._choose_words)
-                self._words = self._select({DEFAULT: DEFAULT}, "wording", DEFAULT)
+                self._words = _select({DEFAULT: DEFAULT}, "wording", words("Wording"), DEFAULT)
                 self._discard = button("discard-protocol", words("Discard this list"), self._discard_protocol)
             ProtocolForm(page, controller, lambda path: self._list_protocols(str(path)))
             with ui.row().classes("w-full items-start"):
@@ -280,31 +258,16 @@ class _Form:
                 summary(words("More settings"))
                 with ui.column():
                     layouts = {"": words("Default (plush-15)")} | controller.layouts()
-                    self._layout = self._select(layouts, "layout", "")
+                    self._layout = _select(layouts, "layout", words("Sensor layout of the toy"), "")
                     self._simulated = ui.checkbox(words("This is a virtual toy: mark the recordings as a simulation"))
                     self._anew = ui.checkbox(words("Begin a new session even if the person's last one is unfinished"))
-                    self._mark = tag(
-                        ui.checkbox(words("Mark the moment of the first start for the video (white flash and tone)")),
-                        "mark-first",
-                    )
-                    self._lsl = tag(
-                        ui.checkbox(words("Send markers of the recordings by LSL (for LabRecorder)")), "lsl"
-                    )
+                    mark = words("Mark the moment of the first start for the video (white flash and tone)")
+                    self._mark = tag(ui.checkbox(mark), "mark-first")
+                    lsl = words("Send markers of the recordings by LSL (for LabRecorder)")
+                    self._lsl = tag(ui.checkbox(lsl), "lsl")
                     self._lsl.set_visibility(find_spec("pylsl") is not None)
             self._begin = button("begin", words("Begin the session"), self._begin_session, "unelevated size=lg")
         self._choose_words()
-
-    def _input(self, key: str, hint: str) -> ui.input:
-        words = self._page.words
-        field = ui.input(label=words(_LABELS[key])).props(f'outlined hint="{words(_HINTS[hint])}"')
-        return tag(field, key).classes("w-64")
-
-    def _select(self, options: dict[str, str], key: str, value: str) -> ui.select:
-        label = self._page.words(_LABELS[key])
-        value = value if value in options else next(iter(options))
-        field = ui.select(options, value=value, label=label).props("outlined")
-        named(field, label)
-        return tag(field, key).style("width: 27rem; max-width: 100%")
 
     def _titles(self) -> dict[str, str]:
         words = self._page.words
@@ -380,6 +343,16 @@ class _Form:
         else:
             return False
         return True
+
+
+def _input(name: str, label: str, hint: str) -> ui.input:
+    return tag(ui.input(label=label).props(f'outlined hint="{hint}"'), name).classes("w-64")
+
+
+def _select(options: dict[str, str], name: str, label: str, value: str) -> ui.select:
+    value = value if value in options else next(iter(options))
+    field = named(ui.select(options, value=value, label=label).props("outlined"), label)
+    return tag(field, name).style("width: 27rem; max-width: 100%")
 
 
 def _short(value: Any) -> str:

@@ -29,18 +29,8 @@ from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.preparation import WHOLE_PEOPLE
 from plushsense.workflow.reporting import LEARNING, PREDICTIONS, SCORES, load_evaluation
 
-_OVER: Texts = {
-    "subjects": "{n}",
-    "folds": "{n}",
-    "trainings": "{n} (folds × seeds)",
-    "held_back": "{n} held back",
-}
-
-_MARKS: Texts = {
-    "simulation": "simulation",
-    "leaky": "leaky",
-}
-
+_OVER: Texts = {"trainings": "{n} (folds × seeds)", "held_back": "{n} held back"}
+_MARKS: Texts = {"simulation": "simulation", "leaky": "leaky"}
 _SPLITS: Texts = {
     "leave-one-subject-out": "each person left out",
     "by-subject": "people in {k} groups",
@@ -59,10 +49,7 @@ _CONTEXTS: Texts = {
     "inside": "within the gesture",
 }
 
-LINKS: Texts = {
-    "live": "Try it live",
-    "export": "Export for the toy",
-}
+LINKS: Texts = {"live": "Try it live", "export": "Export for the toy"}
 """Links from a network to the pages that use it."""
 
 
@@ -74,11 +61,6 @@ def figure(words: Words, value: float | None) -> str:
 def score_text(words: Words, mean: float | None, sd: float | None) -> str:
     """Format a mean and standard deviation, as in ``0.573 ± 0.120``."""
     return figure(words, mean) + ("" if mean is None or sd is None else f" ± {figure(words, sd)}")
-
-
-def whole(words: Words, n: int) -> str:
-    """Format a whole number with groups of three digits."""
-    return words.count(n)
 
 
 def counted(words: Words, kind: str, n: int) -> str:
@@ -96,6 +78,14 @@ def duration_text(words: Words, seconds: float) -> str:
     return words("about {h} h {n} min", h=minutes // 60, n=minutes % 60)
 
 
+def leaky_warning(words: Words) -> str:
+    """Return the warning about a score of a leaky split."""
+    return words(
+        "Leaky: parts of one recording are on both sides of this split, so the score is too good. Never report it as "
+        "the score for new people."
+    )
+
+
 def score_labels(words: Words, leaky: bool, simulated: bool) -> Markup:
     """Render the labels *simulation* and *leaky* if they apply to a score."""
     kinds = [kind for kind, true in (("simulation", simulated), ("leaky", leaky)) if true]
@@ -105,7 +95,7 @@ def score_labels(words: Words, leaky: bool, simulated: bool) -> Markup:
 
 def averaged_over(words: Words, kind: str, units: int) -> str:
     """Describe over what a mean was computed, such as 5 folds."""
-    return words(_OVER[kind], n=counted(words, _UNITS[kind], units))
+    return words(_OVER.get(kind, "{n}"), n=counted(words, _UNITS[kind], units))
 
 
 def split_text(words: Words, split: str) -> str:
@@ -358,11 +348,11 @@ def read_json(path: Path) -> Any:
     """Read a JSON file; raise BadInput if it cannot be read."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as cause:
-        raise _unreadable(path, cause) from None
+    except (OSError, ValueError, RecursionError):
+        raise _unreadable(path) from None
 
 
-def _unreadable(path: Path, cause: Exception) -> BadInput:
+def _unreadable(path: Path) -> BadInput:
     return BadInput("The result “{name}” cannot be read. Compute it again.", name=path.parent.name)
 
 
@@ -414,7 +404,6 @@ class MisreadRecording(NamedTuple):
 class DatasetCounts:
     """Counts of a data set, without excluded recordings."""
 
-    name: str
     people: int
     recordings: int
     gestures: tuple[str, ...]
@@ -446,10 +435,9 @@ class StoredResults:
 
     def row(self, identity: str) -> ResultRow:
         """Return the result with this id; raise BadInput if there is none."""
-        found = self.find(identity)
-        if found is not None:
-            return found
-        raise BadInput("This result does not exist any more: its folder was moved or deleted.")
+        if (found := self.find(identity)) is None:
+            raise BadInput("This result does not exist any more: its folder was moved or deleted.")
+        return found
 
     def find(self, identity: str) -> ResultRow | None:
         """Return the result with this id, or None."""
@@ -459,8 +447,8 @@ class StoredResults:
         """Read the details of a result; raise PlushSenseError if its files cannot be read."""
         try:
             return self._details(row)
-        except _READ_ERRORS as cause:
-            raise _unreadable(row.path / SCORES, cause) from None
+        except _READ_ERRORS:
+            raise _unreadable(row.path / SCORES) from None
 
     def _details(self, row: ResultRow) -> ResultDetails:
         if row.kind == EVALUATION:
@@ -544,21 +532,17 @@ class StoredResults:
             people = {r.subject for r in data.used} & set(data.subjects)
             used = {r.gesture for r in data.used}
             labels = tuple(label for label in data.gestures.labels if label in used)
+            counts = DatasetCounts(len(people), len(data.used), labels, len(data.streams), data.head.simulated)
             # Read the time stamps now, because opening the data set may have rewritten the index.
-            self._read[key] = (
-                file_stamps(*files),
-                DatasetCounts(
-                    data.head.name, len(people), len(data.used), labels, len(data.streams), data.head.simulated
-                ),
-            )
-        counts: DatasetCounts = self._read[key][1]
-        return counts
+            self._read[key] = (file_stamps(*files), counts)
+        found: DatasetCounts = self._read[key][1]
+        return found
 
     def _inside(self, path: Path) -> Path:
         """Return the path of a file; raise PlushSenseError if it leads out of the workspace, or is too large."""
         self._workspace.inside(path)
         if path.is_file() and path.stat().st_size > _MOST_BYTES:
-            raise _unreadable(path, ValueError(f"over {_MOST_BYTES >> 20} MB"))
+            raise _unreadable(path)
         return path
 
     def _once(self, path: Path, read: Callable[[Path, Any], T], more: Any, refuse: bool = False) -> T | None:
@@ -571,7 +555,7 @@ class StoredResults:
                 cached = (stamp, read(self._inside(path), more))
             except (PlushSenseError, *_READ_ERRORS) as cause:
                 if refuse:
-                    raise cause if isinstance(cause, PlushSenseError) else _unreadable(path, cause) from None
+                    raise cause if isinstance(cause, PlushSenseError) else _unreadable(path) from None
                 cached = (stamp, None)
             self._read[key] = cached
         result: T | None = cached[1]

@@ -11,18 +11,17 @@ from nicegui import ui
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, section, tag
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
-from plushsense.studio.pages.train.results import (
+from plushsense.studio.pages.train.job_requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
+from plushsense.studio.pages.train.stored_results import (
     LINKS,
     ResultRow,
     StoredResults,
     counted,
     duration_text,
     score_labels,
-    whole,
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits, people_table
-from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, Plot
+from plushsense.studio.widgets.elements import JOB_STATES, KINDS_OF_TRAINING, Plot
 
 _CURVES_ABOUT: Texts = {
     "make": (
@@ -38,12 +37,7 @@ _CURVES_ABOUT: Texts = {
     "search": "The best score after each training.",
 }
 
-_METRICS: Texts = {
-    "loss": "Loss",
-    "accuracy": "Accuracy",
-    "best": "Best so far",
-}
-
+_METRICS: Texts = {"loss": "Loss", "accuracy": "Accuracy", "best": "Best so far"}
 _LINES: Texts = {
     "training": "training data",
     "accuracy": "accuracy",
@@ -66,13 +60,6 @@ _STAGES: Texts = {
     "deciding": "fitting the decision settings",
     "evaluating": "testing on people left out",
     "learning": "measuring what more people would add",
-}
-
-_STATES: Texts = {
-    "running": "running",
-    "done": "done",
-    "refused": "failed",
-    "stopped": "stopped",
 }
 
 LOSS, ACCURACY, BEST = "loss", "accuracy", "best"
@@ -149,19 +136,19 @@ class JobsSection:
     """
 
     def __init__(self, page: Page, jobs: Jobs, results: StoredResults, open_result: Callable[[str], Any]) -> None:
-        self._page, self._jobs, self._words, self.open_result = page, jobs, page.words, open_result
+        self._page, self.jobs, self.words, self.open_result = page, jobs, page.words, open_result
         self.results = results
         self._open: set[str] = {job.id for job in self._all()[:1]}
         self._closed: set[str] = set()
         self._cards: dict[str, _Card] = {}
         self._built: Any = None
         self._done: set[str] = set()
-        with section(self._words("Jobs"), classes=""):
+        with section(self.words("Jobs"), classes=""):
             self._place = ui.column().classes("w-full")
         self.refresh()
 
     def _all(self) -> list[StudioJob]:
-        return [job for job in self._jobs.all(MAKE, *KINDS) if not job.spec.get("dry")]
+        return [job for job in self.jobs.all(MAKE, *KINDS) if not job.spec.get("dry")]
 
     def refresh(self) -> bool:
         """Update the section, and return whether a job ended since the last call, which may have saved something."""
@@ -184,7 +171,7 @@ class JobsSection:
     def _build(self, opened: list[StudioJob], rest: list[StudioJob]) -> None:
         self._place.clear()
         self._cards = {}
-        w = self._words
+        w = self.words
         with self._place:
             if not opened and not rest:
                 ui.label(w("Nothing has been trained here yet.")).classes("ps-dim")
@@ -197,7 +184,7 @@ class JobsSection:
                         self._line(job)
 
     def _line(self, job: StudioJob) -> None:
-        w = self._words
+        w = self.words
         with ui.row().classes("w-full items-center"):
             _badge(w, job.state)
             ui.label(f"{w(KINDS_OF_TRAINING[job.task])}: {job.title}").classes("flex-grow")
@@ -216,14 +203,10 @@ class JobsSection:
         self._closed.add(identity)
         self.refresh()
 
-    def stop(self, identity: str) -> None:
-        """Stop a job, which can be resumed later."""
-        self._jobs.stop(identity)
-
     def resume(self, identity: str) -> None:
         """Resume a job."""
         with self._page.show_errors():
-            self._jobs.resume(identity)
+            self.jobs.resume(identity)
         self.refresh()
 
 
@@ -231,8 +214,8 @@ class _Card:
     """Card of one job."""
 
     def __init__(self, jobs: JobsSection, job: StudioJob) -> None:
-        self._jobs, self._job, self._words = jobs, job, jobs._words
-        w = self._words
+        self._section, self._job = jobs, job
+        self._words = w = jobs.words
         self._plots: list[tuple[str, Plot, tuple[str, ...]]] = []
         self._bar: ui.linear_progress | None = None
         self._text: ui.label | None = None
@@ -287,7 +270,7 @@ class _Card:
     def _lines(self, chart: ProgressChart) -> list[dict[str, Any]]:
         return [
             {
-                "label": self._words(_LINES.get(name, name)),
+                "label": self._words(_LINES[name]),
                 "stroke": LINES[i % len(LINES)],
                 "width": 2,
                 "points": len(chart.x) < 3,
@@ -325,16 +308,16 @@ class _Card:
         job, w = self._job, self._words
         with ui.row():
             if job.state == RUNNING:
-                button("stop", w("Stop"), lambda: self._jobs.stop(job.id), icon="stop")
+                button("stop", w("Stop"), lambda: self._section.jobs.stop(job.id), icon="stop")
             else:
                 if job.state in (STOPPED, REFUSED):
-                    button("resume", w("Continue"), lambda: self._jobs.resume(job.id), icon="play_arrow")
-                button("", w("Hide"), lambda: self._jobs.close(job.id), "flat", about=job.title)
+                    button("resume", w("Continue"), lambda: self._section.resume(job.id), icon="play_arrow")
+                button("", w("Hide"), lambda: self._section.close(job.id), "flat", about=job.title)
 
     def _result(self) -> None:
         job, w = self._job, self._words
         identity = _identity(job)
-        row = self._jobs.results.find(identity)
+        row = self._section.results.find(identity)
         if row is None:
             tag(ui.label(w("The result was removed or cannot be read.")).classes("ps-dim"), "result")
         else:
@@ -349,7 +332,7 @@ class _Card:
             self._links()
             if row is not None:
                 show = w("Open in the results")
-                button("open-result", show, lambda: self._jobs.open_result(identity), "flat dense", about=job.title)
+                button("open-result", show, lambda: self._section.open_result(identity), "flat dense", about=job.title)
 
     def _verdict(self, row: ResultRow) -> None:
         w = self._words
@@ -363,9 +346,8 @@ class _Card:
             ui.label(w("Simulation: these data say nothing about a real toy."))
         tag(ui.label(figures(w, row)).classes("ps-dim"), "result")
         if row.people:
-            with tag(
-                ui.expansion(w("Scores of each person"), icon="groups", value=True).classes("w-full"), "people-bars"
-            ):
+            bars = ui.expansion(w("Scores of each person"), icon="groups", value=True).classes("w-full")
+            with tag(bars, "people-bars"):
                 html(people_table(w, row)).classes("ps-scroll-x")
 
     def _cut(self, cut: dict[str, Any]) -> str:
@@ -377,17 +359,12 @@ class _Card:
 
     def _saved_network(self) -> None:
         """Name the network that a stopped job has saved already."""
-        bundle = _saved_bundle(self._job)
-        if bundle:
-            tag(
-                ui.label(
-                    self._words(
-                        "The network “{name}” is saved and can be used. Its test on people left out is not finished.",
-                        name=Path(bundle).stem,
-                    )
-                ),
-                "saved",
+        if bundle := _saved_bundle(self._job):
+            saved = self._words(
+                "The network “{name}” is saved and can be used. Its test on people left out is not finished.",
+                name=Path(bundle).stem,
             )
+            tag(ui.label(saved), "saved")
             with ui.row():
                 self._links()
 
@@ -424,7 +401,7 @@ def warning_texts(w: Words, job: StudioJob) -> list[str]:
 def _progress_text(w: Words, at: dict[str, Any]) -> str:
     """Describe the progress of a job in words."""
     parts = [w(_STAGES[at.get("stage", "reading")])]
-    at = {key: whole(w, value) if key in ("networks", "trainings") else value for key, value in at.items()}
+    at = {key: w.count(value) if key in ("networks", "trainings") else value for key, value in at.items()}
     if "rung" in at:
         parts.append(
             w("round {rung} of {rungs}, {networks} networks", **{key: at[key] for key in ("rung", "rungs", "networks")})
@@ -443,5 +420,5 @@ def _progress_text(w: Words, at: dict[str, Any]) -> str:
 
 
 def _badge(w: Words, state: str) -> ui.label:
-    badge = ui.label(w(_STATES[state])).classes("q-px-sm rounded-borders")
+    badge = ui.label(w(JOB_STATES[state])).classes("q-px-sm rounded-borders")
     return badge.style(f"background: {_BADGES[state]}; color: #fff; font-weight: 600")

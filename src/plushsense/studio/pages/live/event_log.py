@@ -4,29 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Any
 
 from markupsafe import Markup
 from nicegui import ui
 
 from plushsense.reports.table import Table
 from plushsense.studio.app.shell import AFFECT_SIGNS, Page, add_style, button, html, moment, on_change, tag
-from plushsense.studio.app.words import Texts, Words
+from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import plain_name
 from plushsense.studio.pages.live.feed import VIEW_TEXTS
+from plushsense.studio.pages.live.live_state import EventSpan
 from plushsense.studio.pages.live.reader import LiveReader
-from plushsense.studio.pages.live.state import EventSpan
 from plushsense.studio.widgets.elements import table_html
-
-_HEADS: Texts = {
-    "time": "Time",
-    "person": "Person",
-    "gesture": "Gesture",
-    "affect": "Affect",
-    "confidence": "Confidence",
-    "lasted": "Duration",
-    "reaction": "Reaction of the toy",
-}
 
 _PRINT = """
 .lv-print { display: none; }
@@ -39,34 +28,33 @@ _PRINT = """
 """
 
 
-def log_rows(events: Sequence[EventSpan]) -> list[dict[str, Any]]:
-    """Return one row for each event, with plain values for a file."""
-    rows = []
-    for event in events:
-        rows.append(
-            {
-                "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(event.at)),
-                "toy_s": round(event.begin_s, 2),
-                "lasted_s": None if event.end_s is None else round(event.end_s - event.begin_s, 2),
-                "gesture": event.gesture or "",
-                "affect": event.affect,
-                "confidence": None if event.confidence is None else round(event.confidence, 3),
-                "source": event.source,
-                "eyes": event.eyes,
-                "sound": event.sound,
-                "really": "" if event.really is None else event.really or "nothing",
-                "person": event.subject,
-                "network": event.network,
-                "simulated": "yes" if event.simulated else "no",
-            }
-        )
-    return rows
+def log_table(events: Sequence[EventSpan]) -> Table:
+    """Return a table with one row for each event, for a file."""
+    rows = [
+        {
+            "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(event.at)),
+            "toy_s": round(event.begin_s, 2),
+            "lasted_s": None if event.end_s is None else round(event.end_s - event.begin_s, 2),
+            "gesture": event.gesture or "",
+            "affect": event.affect,
+            "confidence": None if event.confidence is None else round(event.confidence, 3),
+            "source": event.source,
+            "eyes": event.eyes,
+            "sound": event.sound,
+            "really": "" if event.really is None else event.really or "nothing",
+            "person": event.subject,
+            "network": event.network,
+            "simulated": "yes" if event.simulated else "no",
+        }
+        for event in events
+    ]
+    return Table.from_rows("log", "", rows)
 
 
 def printed(words: Words, events: Sequence[EventSpan]) -> Markup:
     """Return the log as a page for printing, in the language of ``words``."""
     virtual = any(event.really is not None for event in events)
-    head = [words(head) for head in _HEADS.values()]
+    head = words.each("Time", "Person", "Gesture", "Affect", "Confidence", "Duration", "Reaction of the toy")
     head += [words("Really made")] if virtual else []
     rows = []
     for event in events:
@@ -81,20 +69,14 @@ def printed(words: Words, events: Sequence[EventSpan]) -> Markup:
             "" if event.end_s is None else f"{words.number(event.end_s - event.begin_s, 1)} s",
             ", ".join(reaction),
         ]
-        row += [words.gesture(event.really or words("nothing"))] if virtual and event.really is not None else []
-        row += [""] if virtual and event.really is None else []
+        if virtual:
+            row.append("" if event.really is None else words.gesture(event.really or words("nothing")))
         rows.append(row)
-    networks = ", ".join(dict.fromkeys(event.network for event in events))
-    about = (
-        words("Session begun {when}. Network: {network}.", when=moment(events[0].session), network=networks)
-        if events
-        else words("No event yet.")
-    )
-    mark = (
-        words("Simulation: these data say nothing about a real toy.")
-        if any(event.simulated for event in events)
-        else ""
-    )
+    about, mark = words("No event yet."), words("Simulation: these data say nothing about a real toy.")
+    if events:
+        when, networks = moment(events[0].session), ", ".join(dict.fromkeys(event.network for event in events))
+        about = words("Session begun {when}. Network: {network}.", when=when, network=networks)
+    mark = mark if any(event.simulated for event in events) else ""
     return Markup("<h2>{}</h2><p>{}</p><p><b>{}</b></p>{}").format(
         words("Log of the session"), about, mark, table_html(head, rows, numbers=(4, 5)) if rows else ""
     )
@@ -147,10 +129,9 @@ class LogButtons:
 
     def _download(self) -> None:
         events = self._events()
-        text = Table.from_rows("log", "", log_rows(events)).csv()
         people = sorted({event.subject for event in events if event.subject})
         name = "-".join(["live", time.strftime("%Y-%m-%d-%H%M", time.localtime(events[0].session)), *people])
-        ui.download.content(text, f"{plain_name(name, 'live')}.csv", "text/csv")
+        ui.download.content(log_table(events).csv(), f"{plain_name(name, 'live')}.csv", "text/csv")
 
     def _open_print(self) -> None:
         self._sheet.set_content(printed(self._page.words, self._events()))

@@ -48,11 +48,6 @@ class JobRequest:
     command: str
 
     @property
-    def dry(self) -> dict[str, Any]:
-        """The spec of a job that only estimates the cost of this one."""
-        return {**self.spec, "dry": True}
-
-    @property
     def key(self) -> str:
         """Text that identifies the job; it is equal for jobs that differ only in the output file."""
         return json.dumps([self.task, {k: v for k, v in self.spec.items() if k != "out"}], sort_keys=True)
@@ -98,10 +93,8 @@ def job_request(workspace: Workspace, jobs: Jobs, form: Mapping[str, Any]) -> Jo
     given = {key: value for key, value in form.items() if value not in (None, "")}
     if kind == MAKE:
         request = _make(workspace, jobs, dataset, given)
-    elif kind == TRAIN:
-        request = _train(workspace, dataset, given)
-    elif kind == EVALUATE:
-        request = _evaluate(workspace, dataset, given)
+    elif kind in (TRAIN, EVALUATE):
+        request = {TRAIN: _train, EVALUATE: _evaluate}[kind](workspace, dataset, given)
     else:
         request = _of_grid(workspace, kind, dataset, given)
     for job in jobs.all(kind):
