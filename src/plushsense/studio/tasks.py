@@ -120,6 +120,267 @@ def _import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     settings: dict[str, Any] = {"add_to": True} if spec.get("add") else {"name": spec.get("name") or None}
     with _collected(spec) as source:
         done = import_recordings(source, spec["dest"], progress=reporter.count, **settings)
+    stored = done.to_json()
+    result = {key: stored[key] for key in ("recordings", "subjects", "added", "rejected")}
+    return {**result, "dataset": str(spec["dest"]), "warnings": list(done.notes), "flagged": len(done.warnings)}
+
+
+@contextmanager
+def _collected(spec: dict[str, Any]) -> Iterator[Path]:
+    """Yield a temporary folder with only the chosen sessions, as hard links if the file system supports them."""
+    recordings = Path(spec["recordings"])
+    work = Path(spec["work"])
+    work.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=work) as place:
+        folder = Path(place) / "recordings"
+        for session in spec["sessions"]:
+            inside = Path(session).relative_to(recordings)
+            shutil.copytree(recordings / inside, folder / inside, copy_function=_link_or_copy)
+        yield folder
+
+
+def _link_or_copy(source: str, target: str) -> str:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+    return target
+
+
+def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Make the data set ``dest`` of the folder or file of each path in ``sources``; return what it contains.
+
+    A source that cannot be imported is among ``rejected``, unless all are. ``layout`` and ``person`` may be "", see
+    `import_recordings`. A single backup is restored.
+    """
+    dest, sources = Path(spec["dest"]), [Path(source) for source in spec["sources"]]
+    notes: list[str] = []
+    rejected: list[dict[str, str]] = []
+    refusals: list[PlushSenseError] = []
+    restored = len(sources) == 1 and is_backup(sources[0])
+    flagged = 0
+    if restored:
+        restore(sources[0], dest, progress=reporter.count)
+        sources = []
+    for source in sources:
+        adding = dest.exists()
+        settings: dict[str, Any] = {} if adding or not spec["layout"] else {"layout": spec["layout"]}
+        try:
+            done = import_recordings(
+                source,
+                dest,
+                add_to=adding,
+                person=spec["person"],
+                guess_layout=not adding,
+                # What a single source proves may not fit the others.
+                adopt_proposals=len(sources) == 1 and not adding,
+                limits=UNPACKED,
+                progress=reporter.count,
+                **settings,
+            )
+        except PlushSenseError as refusal:
+            refusals.append(refusal)
+            rejected.append({"file": source.name, "reason": refusal.message})
+            continue
+        notes += done.notes
+        rejected += [entry.to_json() for entry in done.rejected]
+        flagged += len(done.warnings)
+    if not dest.exists():
+        raise refusals[0]
+    if len(sources) > 1:
+        notes += propose(done, adopting=True).notes[len(done.notes) :]
+    dataset = open_dataset(dest)
+    return {
+        "name": dataset.head.name if restored else "",
+        "restored": restored,
+        "layout": dataset.head.layout.name,
+        "simulated": dataset.head.simulated,
+        "recordings": len(dataset.recordings),
+        "people": dict(Counter(r.subject for r in dataset.recordings)),
+        "gestures": dict(Counter(r.gesture for r in dataset.recordings)),
+        "notes": list(dict.fromkeys(notes)),
+        "flagged": flagged,
+        "rejected": rejected,
+    }
+
+
+def _simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Simulate ``people`` persons with ``repetitions`` as the new data set ``dest``; use ``work`` temporarily."""
+    work = Path(spec["work"])
+    work.mkdir(parents=True, exist_ok=True)
+    # The sessions can be temporary, because the data set contains copies of the recordings.
+    with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=work) as place:
+        done = simulate(
+            Path(place) / "sessions",
+            people=int(spec["people"]),
+            repetitions=int(spec["repetitions"]),
+            seed=int(spec.get("seed", 1)),
+            dataset=spec["dest"],
+            progress=lambda step, at, total: reporter.progress(what=step, done=at, total=total),
+        )
+    return {"dataset": str(spec["dest"]), "recordings": done.recordings, "people": done.people}
+
+
+def _backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Write the data set ``dataset`` into the new backup ``place``."""
+    return {**asdict(backup(spec["dataset"], spec["place"], progress=reporter.count)), "dataset": spec["dataset"]}
+
+
+def _restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Restore the backup ``file`` as the new data set ``dest`` with the name ``name``."""
+    # One of the studio's own backups: only the disk limits it.
+    limits = UnpackLimits(max(1, shutil.disk_usage(Path(spec["file"]).parent).free), files=1 << 30)
+    dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits)
+    write_file(dataset.path / HEAD, replace(dataset.head, name=spec["name"]).to_toml())
+    return {"dataset": str(spec["dest"]), "recordings": len(dataset.recordings), "people": len(dataset.subjects)}
+
+
+def _forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Remove ``person`` from ``dataset``; the result does not name the person.
+
+    Raises:
+        ConfigError: if ``person`` is missing, as in a job resumed after a restart, because it is never stored.
+    """
+    if "person" not in spec:
+        raise ConfigError("The person's code is not stored. Choose the person again in the menu of the data set.")
+    return {"dataset": spec["dataset"], "files": len(forget(spec["dataset"], spec["person"]).files)}
+
+
+def _publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Publish ``dataset`` as the package ``place``; the other keys are those of `PublishSpec`."""
+    key = spec.get("key") or None
+    if key is not None:
+        try:
+            Path(key).parent.mkdir(parents=True, exist_ok=True)
+        except OSError as cause:
+            file, why = Path(key).name, cause.strerror or str(cause)
+            raise DatasetError("The key file “{file}” cannot be written: {why}.", file=file, why=why) from None
+    options = {name: value for name, value in spec.items() if name not in ("dataset", "place")}
+    options |= {"key": key}
+    return publish_dataset(spec["dataset"], spec["place"], PublishSpec(**options), reporter.stage).to_dict()
+
+
+def _validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Validate the package ``place``, a folder or a zip."""
+    return validate_package(spec["place"], progress=reporter.stage).to_dict()
+
+
+def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`."""
+    config = from_settings(**spec.get("settings", {}))
+    if spec.get("dry"):
+        from plushsense.workflow.estimate import preview_training
+
+        return preview_training(spec["dataset"], config, warn=reporter.warn).to_json()
+    out = Path(spec["out"])
+    check_folder(out.parent, "A bundle")
+    reporter.progress(stage="reading", share=0.0)
+    clock, tuning, epochs = Clock(), int(spec.get("quantize_aware", 0)), config.training.epochs
+    each, again = epochs + tuning, refits(config, count_people(open_dataset(spec["dataset"])))
+
+    def epoch(at: int, of: int, row: EpochRow) -> None:
+        what = str(row.get("what", ""))
+        second, part = what.startswith(REFIT), what.removeprefix(REFIT).lstrip(", ")
+        past = epochs if part else 0
+        stage = "refitting" if second else "fine-tuning" if part else "training"
+        scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "accuracy")}
+        share = (each * second + past + at) / (each * (1 + again))
+        reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(share))
+        if at == of and second == again and not tuning:
+            reporter.progress(stage="deciding", epoch=at, epochs=of, share=1.0)
+
+    done = train(
+        spec["dataset"],
+        config,
+        quantize_aware=tuning,
+        fit_decisions=bool(spec.get("fit_decisions", True)),
+        journal=unfinished(spec["dataset"]),
+        progress=epoch,
+        warn=reporter.warn,
+    )
+    bundle = done.save(free_path(out, done.bundle.to_bytes()))
+    return {"bundle": str(bundle)}
+
+
+def _make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Train a network and evaluate it on people left out, in about ``minutes``; see `make_network`."""
+    out = Path(spec["out"])
+    reporter.progress(stage="reading", share=0.0)
+
+    from plushsense.workflow.budget import BudgetProgress, make_network
+
+    clock = Clock()
+
+    def report(at: BudgetProgress) -> None:
+        row = {key: value for key, value in at.row.items() if key != "learning_rate"}
+        what = str(row.get("what", ""))
+        stage = "refitting" if what.startswith(REFIT) else at.stage
+        reporter.progress(**row | {"stage": stage, "bundle": at.bundle}, **clock.at(at.share))
+
+    settings = spec.get("settings")
+    done = make_network(
+        spec["dataset"],
+        out,
+        budget_s=60.0 * spec["minutes"],
+        config=from_settings(**settings) if settings else None,
+        progress=report,
+        warn=reporter.warn,
+    )
+    return {**done.to_json(), "out": str(done.evaluation)}
+
+
+def _evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Evaluate; return the output folder, the report and the main scores, or the estimate for a dry run."""
+    config = from_settings(**spec.get("settings", {}), split=spec.get("split") or None)
+    if spec.get("dry"):
+        from plushsense.workflow.estimate import preview_evaluation
+
+        return preview_evaluation(spec["dataset"], config, warn=reporter.warn).to_json()
+    reporter.progress(stage="reading", share=0.0)
+
+    from plushsense.workflow.api import FoldsSpec, evaluate_run
+    from plushsense.workflow.preparation import prepare
+    from plushsense.workflow.reporting import PAGE, write_report
+
+    dataset = open_dataset(spec["dataset"])
+    made = prepare(dataset, config, reporter.warn)
+    out = dataset.path / "evaluations" / made.name
+    clock = Clock()
+
+    def fold(at: JobProgress) -> None:
+        row = at.message[2] if at.epoch else {}
+        counts = {"done": at.done, "folds": at.total, "resumed": at.resumed, "fold": at.name}
+        loss = {"train_loss": row.get("train_loss")}
+        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **loss, **clock.at(at.share))
+
+    evaluate_run(made, FoldsSpec(out, int8=bool(spec.get("int8"))), progress=fold, warn=reporter.warn)
+    write_report(out / PAGE, dataset, [out])
+    return {"out": str(out)}
+
+
+def _sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Run a sweep; return the folder ``out`` and main values of the result, or the preview for a dry run."""
+    from plushsense.experiments.sweep.run import SweepProgress, SweepSpec, preview, sweep
+
+    asked = SweepSpec(spec["grid"], spec.get("changes", {}))
+    if spec.get("dry"):
+        return preview(spec["dataset"], asked, measure=True, warn=reporter.warn).to_json()
+    reporter.progress(stage="reading", share=0.0)
+    clock = Clock()
+
+    def training(at: SweepProgress) -> None:
+        row = at.best and at.best.row
+        best = row and {key: row[key] for key in ("arch", "filters", "accuracy", "macro_f1")}
+        counts: dict[str, Any] = {"done": at.done, "trainings": at.total, "resumed": at.resumed, "what": at.name}
+        if at.rung:
+            counts |= {"rung": at.rung, "rungs": at.rungs, "networks": at.networks}
+        share = min(1.0, at.share)
+        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(share))
+
+    done = sweep(spec["dataset"], asked, progress=training, warn=reporter.warn)
+    for lost in done.head["failed"]:
+        network = f"{lost['arch']} {lost['filters']}"
+        reporter.warn(Message("The network {network} was given up, because its training failed.", network=network))
     halving = done.head.get("halving", {})
     return {"out": str(done.out), "best": done.head["best"], "winner": halving.get("winner", {})}
 
