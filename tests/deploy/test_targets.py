@@ -202,7 +202,7 @@ def test_missing_tools_are_named_by_package(monkeypatch: pytest.MonkeyPatch, tmp
         "qemu-system-misc",
         "picolibc-riscv64-unknown-elf",
     ]
-    assert missing_tools("host", CompileSpec("clang")) == ["clang"]
+    assert missing_tools("host", cc="clang") == ["clang"]
     with pytest.raises(ToolError, match="install Debian's gcc-xtensa-lx106 qemu-system-misc .*, or leave this target"):
         require("xtensa")
     with pytest.raises(ToolError):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
@@ -16,6 +16,7 @@ from plushsense.devices.base import Frame
 from plushsense.runtime.classifier import StreamClassifier
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
+from plushsense.tuning import decisions
 from plushsense.tuning.decisions import (
     LabelledSteps,
     coverage_of,
@@ -115,9 +116,10 @@ def made(tmp_path):
     return make
 
 
-def test_a_fit_on_streams_says_on_what_and_comes_back_from_a_bundle(made, bundle):
+def test_a_fit_on_streams_says_on_what_and_comes_back_from_a_bundle(made, bundle, monkeypatch):
+    monkeypatch.setattr(decisions, "COVERAGE", 0.8)  # so few people cannot promise more
     dataset, model = made(), bundle()
-    spec = fit_decisions(model, dataset, ["P1", "P2"], training=["P3"], coverage=0.8)
+    spec = fit_decisions(model, dataset, ["P1", "P2"], training=["P3"])
     fitted = spec.fitted
     assert (fitted["people"], fitted["streams"]) == (2, 2)
     assert fitted["hours"] == pytest.approx(2 * 60 / 3600, abs=0.001)
@@ -132,8 +134,8 @@ def test_a_fit_on_streams_says_on_what_and_comes_back_from_a_bundle(made, bundle
     back = DecideSpec.from_dict(replace(model, decision=spec.to_dict()).decision)
     assert back == spec
     # The same people, the same settings; other people, other ones.
-    assert fit_decisions(model, dataset, ["P2", "P1"], training=["P3"], coverage=0.8) == spec
-    assert fit_decisions(model, dataset, ["P4"], training=["P3"], coverage=0.8).sure != spec.sure
+    assert fit_decisions(model, dataset, ["P2", "P1"], training=["P3"]) == spec
+    assert fit_decisions(model, dataset, ["P4"], training=["P3"]).sure != spec.sure
 
 
 def test_settings_that_were_given_stay(made, bundle):
@@ -174,12 +176,6 @@ def test_truths_stand_where_the_live_loop_hears_them(made, bundle):
     steps = labelled_steps(model, [heard], DecideSpec())
     assert set(steps.truth.tolist()) == {0, 1}
     assert len(np.unique(steps.recording)) <= 12
-
-
-@pytest.mark.parametrize("value", [0.3, 1.0, float("nan")])
-def test_what_is_no_coverage_is_refused(made, bundle, value):
-    with pytest.raises(ConfigError, match="coverage"):
-        fit_decisions(bundle(), made(people=1), ["P1"], coverage=value)
 
 
 def test_nobody_is_refused(made, bundle):

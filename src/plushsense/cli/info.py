@@ -56,13 +56,14 @@ def _bundle(args: argparse.Namespace) -> int:
         gestures=list(bundle.gestures.labels),
         provenance=bundle.provenance,
     )
-    if bundle.personal:
-        result["adapted"] = {key: value for key, value in bundle.personal.items() if key != "original"}
+    adapted = {key: value for key, value in (bundle.personal or {}).items() if key != "original"}
+    if adapted:
+        result["adapted"] = adapted
     rows = [
         *model_rows(result),
         ("Layout", bundle.layout.name),
         ("Gestures", ", ".join(bundle.gestures.labels)),
-        *((key.capitalize(), value) for key, value in result.get("adapted", {}).items()),
+        *((key.capitalize(), value) for key, value in adapted.items()),
     ]
     # A name from the file must not look like a line of this program.
     emit(args, result, [f"{printable(name):<31}{printable(str(value))}" for name, value in rows])

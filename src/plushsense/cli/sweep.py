@@ -60,7 +60,7 @@ def _preview_lines(preview: SweepPreview) -> list[str]:
     """Format the plan of a sweep as text, or the problems of its grid if there are any."""
     if preview.problems:
         return [f"- {line}" for line in preview.problems]
-    plan = preview.to_json()
+    plan: dict[str, Any] = preview.to_json()
     lines = [
         *(f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in plan["left_out"]),
         *marks(plan),

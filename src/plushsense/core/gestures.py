@@ -197,7 +197,7 @@ class GestureSet:
         found = (merged.find(label) for label in self.labels)
         return _groups(g.label if g else f"\0{k}" for k, g in enumerate(found))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         table = asdict(self)
         for gesture in table["gestures"]:

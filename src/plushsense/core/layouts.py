@@ -487,7 +487,7 @@ class Layout:
         """Return the number of samples in ``seconds``, at least one."""
         return max(1, round(seconds * self.rate_hz))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON; without ``self_calibration`` if it is empty, as before there was one."""
         table = asdict(self)
         if not self.self_calibration:

@@ -58,7 +58,7 @@ class Message(str):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).restored, (str(self), self.template, self.values)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON, from which `from_json` restores the message."""
         return {"message": str(self), "template": self.template, "values": plain(self.values)}
 

@@ -118,7 +118,7 @@ class ModelFacts:
         """Memory of one toy including its struct, with 32-bit pointers."""
         return self.memory_bytes + TOY_BYTES
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the content of ``export.json``; what is empty by default is left out."""
         optional = ("personal", "name", "url", "conversions", "files")
         return {key: value for key, value in asdict(self).items() if value or key not in optional}

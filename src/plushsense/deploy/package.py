@@ -367,7 +367,7 @@ class ExportResult:
     def ram_bytes(self) -> int:
         return self.facts.ram_bytes
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the object that ``plushsense export --json`` prints."""
         facts = self.facts.to_json()
         del facts["files"]

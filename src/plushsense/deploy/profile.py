@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -107,7 +106,7 @@ class Estimate:
         """Verdict as text, with the rate of steps."""
         return f"fits {1000 / self.step_ms:g} Hz: {self.answer}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the estimate as plain values for JSON."""
         core = self.core
         return {
@@ -229,7 +228,7 @@ class Cost:
         """Helper functions for floating point that the library requires; should be empty."""
         return tuple(s for s in self.needs if _FLOAT.match(s))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the cost as plain values for JSON."""
         return {
             "title": TARGETS[self.target].title,
@@ -467,7 +466,7 @@ class Profile:
         ratio = self.arch.macs_per_window / self.arch.macs_per_step
         return {name: round(c.stages["network"] * ratio) for name, c in self.costs.items() if c.stages}
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON, as ``plushsense profile --json`` prints them."""
         counted = {name: c for name, c in self.costs.items() if c.step is not None}
         return {
@@ -588,7 +587,7 @@ class PaperEstimate:
         """Time in ms at the rate of 16-bit integers."""
         return self.macs / INT16_MMAC_S / 1000
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON."""
         return {
             "what": self.what,
@@ -611,7 +610,7 @@ class PaperComparison:
     window_ms: tuple[float, float] | None
     float_bytes: int
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON."""
         return {
             "mmac_s": {"float": FLOAT_MMAC_S, "int16": INT16_MMAC_S},

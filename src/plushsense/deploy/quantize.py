@@ -78,7 +78,7 @@ class Ranges:
     means: tuple[Floats, ...]
     axes: Floats
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the ranges as plain values for JSON."""
         lists = {name: [part.tolist() for part in getattr(self, name)] for name in ("tops", "means")}
         axes = {"axes": self.axes.tolist()} if len(self.axes) else {}
@@ -267,7 +267,7 @@ _MAX_WINDOWS = 1024
 
 def calibration(
     arch: Arch, weights: Mapping[str, NDArray[np.float32]], scaler: Scaler, x: NDArray[np.integer[Any]]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Calibrate on integer training windows (N, C, T); return plain values for the bundle, without samples.
 
     Empty for a network that cannot be deployed, or without windows.

@@ -10,7 +10,6 @@ import threading
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
 from plushsense.core.errors import AddressError, ConfigError, DeviceError, MissingExtraError, PlushSenseError, nearest
@@ -247,7 +246,7 @@ class DeviceListing:
     devices: list[DeviceInfo] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return asdict(self)
 

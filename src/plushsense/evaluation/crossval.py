@@ -188,7 +188,7 @@ class EvaluationResult:
         self.predictions_path = write_predictions(path, self.predictions)
         return self.predictions_path
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             "split": self.split.text,
@@ -403,7 +403,7 @@ class DeployedResult:
     probability_difference: float | None
     rows: tuple[DeployedRow, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         unit = "subject" if self.over == "subjects" else "fold"
         rows = []

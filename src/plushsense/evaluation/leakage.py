@@ -69,7 +69,7 @@ class LeakageResult:
         """Return the share of the scored windows that one of `KINDS` has."""
         return int(getattr(self, kind)) / max(self.windows, 1)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {**vars(self), "pairs": [vars(pair) for pair in self.pairs]}
 

@@ -174,7 +174,7 @@ class FoldResult:
     metrics: Metrics
     by_recording_accuracy: float | None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         fold = self.record
         train, validation, test = fold.windows
@@ -202,7 +202,7 @@ class PersonResult:
     metrics: Metrics
     by_recording_accuracy: float | None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             "subject": self.subject,
@@ -280,7 +280,7 @@ class Scores:
         """Return the mean of a metric over people or folds."""
         return self.means[metric].mean
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         rest = self.with_rest
         return {

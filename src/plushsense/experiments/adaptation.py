@@ -64,7 +64,7 @@ class PersonGain:
     choices_worse: int
     scores: Mapping[str, Mapping[str, float]]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, the scores as keys such as ``accuracy_before``."""
         row = {name: value for name, value in vars(self).items() if name != "scores"}
         return row | {f"{score}_{when}": value for score, at in self.scores.items() for when, value in at.items()}
@@ -177,7 +177,7 @@ class Adapted:
             raise BundleError(f"The bundle was left as it is: {self.personal.reason}.")
         return self.bundle.save(Path(path))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         done = self.personal
         return {
@@ -356,7 +356,7 @@ class AdaptingResult:
             "worse_choices": sum(row.choices_worse for row in self.people) / self.choices,
         }
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             **{key: getattr(self, key) for key in ("split", "simulated", "context", "use", "choices", "refused")},
@@ -440,7 +440,7 @@ class _FoldWork:
     use: int
     spec: PersonalSpec
 
-    def network_key(self, windows: WindowSet) -> dict[str, Any]:
+    def network_key(self, windows: WindowSet) -> dict[str, object]:
         return {
             "windows": windows_fingerprint(windows),
             "arch": self.run.network.to_dict(),

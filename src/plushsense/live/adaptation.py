@@ -86,7 +86,7 @@ class RecordingScores:
     right: int
     log_loss: float
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             "recordings": self.recordings,

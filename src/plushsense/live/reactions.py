@@ -76,7 +76,7 @@ class Reactions:
     lines: tuple[ReactionRule, ...]
     title: str = ""
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON and `from_dict`."""
         return {"name": self.name, "title": self.title, "reactions": [asdict(line) for line in self.lines]}
 
@@ -162,7 +162,7 @@ class Reaction:
     affect: str
     gesture: str | None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {**asdict(self), "t_s": round(self.t_s, 4), "sound": self.sound or None}
 

@@ -472,7 +472,7 @@ class Arch:
                 return TABLE3[self.symbol][row]
         return None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON; the layers as their symbol."""
         others = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("layers", "vector")}
         vectors = {} if self.vector is None else {"vectors": self.vector.vectors}

@@ -81,7 +81,7 @@ class Protocol:
             pairs = [pair for _, pair in sorted((draw(), pair) for pair in pairs)]
         return tuple(Step(n, g, r, self.prompts[g]) for n, (g, r) in enumerate(pairs))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON, from which `from_dict` builds the same protocol without other files."""
         table = asdict(self) | {"gestures": list(self.gestures), "nobody": list(self.nobody)}
         return {key: value for key, value in table.items() if key != "seed" or value}

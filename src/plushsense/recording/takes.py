@@ -127,7 +127,7 @@ class StreamGap:
         clocks = (last.device_ms, now.device_ms if now else None), (last.host_ms, now.host_ms if now else None)
         return cls(rows, *clocks, round(missing_ms), reason)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the gap as sidecars and the log hold it."""
         return asdict(self)
 

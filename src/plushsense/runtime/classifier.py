@@ -8,7 +8,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from plushsense.core.errors import ArrayError, ConfigError
 from plushsense.core.gestures import GestureSet
@@ -47,7 +47,7 @@ class GestureEvent:
     since_s: float
     t_s: float
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         rounded = {"since_s": round(self.since_s, _DECIMALS), "t_s": round(self.t_s, _DECIMALS)}
         values = asdict(self) | rounded
@@ -87,7 +87,7 @@ class Decision:
     answer: str | None = None
     events: tuple[GestureEvent, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values for the line that ``plushsense live`` prints."""
         confidence = None if self.confidence is None else round(self.confidence, _DECIMALS)
         return {

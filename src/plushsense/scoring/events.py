@@ -37,7 +37,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,7 +113,7 @@ class Tally:
         """Return the median and 90th percentile of ``latencies``."""
         return latency_summary(self.latencies)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return counts and scores as plain values, ready for JSON; of the latencies only a summary."""
         table = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "latencies"}
         return table | {
@@ -127,7 +126,7 @@ class Tally:
             "latency_s": self.latency_s(),
         }
 
-    def kept(self) -> dict[str, Any]:
+    def kept(self) -> dict[str, object]:
         """Return all fields as plain values; ``Tally(**values)`` restores the tally."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 

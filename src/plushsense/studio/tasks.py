@@ -90,7 +90,7 @@ class Clock:
         self._last_s = self._start_s = time.monotonic()
         self._start_share = 0.0
 
-    def at(self, share: float) -> dict[str, Any]:
+    def at(self, share: float) -> dict[str, object]:
         """Return a dictionary with ``share`` and ``left_s``, the remaining seconds (None if unknown)."""
         now = time.monotonic()
         if self._start_share == 0.0 or (now - self._last_s < self._instant_s and now - self._start_s < 1.0):

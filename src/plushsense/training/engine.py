@@ -50,7 +50,7 @@ class FitState:
     kept: dict[int, dict[str, NDArray[np.float32]]] = field(default_factory=dict)
     best: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
-    def to_arrays(self) -> dict[str, Any]:
+    def to_arrays(self) -> dict[str, object]:
         """Return the state as arrays and plain values by name, for a journal."""
         arrays: dict[str, Any] = {"epoch": self.epoch, "steps": self.steps, "history": self.history}
         for prefix, weights in ((_WEIGHT, self.weights), (_BEST, self.best)):

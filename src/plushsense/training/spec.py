@@ -102,7 +102,7 @@ class TrainSpec:
             changes["augment"] = tuple(changes["augment"])
         return replace(self, **changes)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON, without ``scaling`` and ``weight_decay`` where they are the default.
 
         ``augment`` with at most a random rotation is written as ``turn_deg``, as in earlier versions, so that the ids
@@ -121,7 +121,7 @@ class TrainSpec:
                 values[key] = list(value)
         return values
 
-    def key(self) -> dict[str, Any]:
+    def key(self) -> dict[str, object]:
         """Return everything that the result depends on: all settings, and the version of the code."""
         # Earlier versions read integers where nothing was scaled.
         reads = {"reads": "units of the layout"} if self.scaling == "none" else {}

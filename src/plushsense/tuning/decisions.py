@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
@@ -50,6 +50,11 @@ class HealthFit:
     seconds: float
     widened: tuple[str, ...]
     still_ms: int
+
+    def to_json(self) -> dict[str, object]:
+        """Return what a bundle keeps of the fit."""
+        hours = round(self.seconds / 3600, 3)
+        return {"hours": hours, "end_stops": list(self.widened), "longest_still_ms": self.still_ms}
 
 
 def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettings | None = None) -> HealthFit:
@@ -142,7 +147,10 @@ def _long_wrong(
 
 
 COVERAGE = 0.9
+"""Share of the labelled steps whose set of classes is to hold the true one."""
 KNOWN_SHARE = 0.95
+"""Share of these steps that are to count as a known gesture."""
+FALSE_ALARMS_PER_HOUR = 1.0
 # The search uses at most this much of the streams, for which it takes about 15 s.
 MOST_SEARCHED_S = 3600.0
 
@@ -176,9 +184,6 @@ def fit_decisions(
     dataset: Dataset,
     subjects: Iterable[str],
     *,
-    coverage: float = COVERAGE,
-    known_share: float = KNOWN_SHARE,
-    false_alarms_per_hour: float = 1.0,
     training: Iterable[str] = (),
     spec: DecideSpec | None = None,
     keep: Collection[str] = (),
@@ -186,11 +191,11 @@ def fit_decisions(
     """Fit all decision settings; ``fitted`` of the result describes the data and the outcome.
 
     - Events: the settings of least cost in the streams of ``subjects`` (`events.tune`).
-    - ``sure``: the split-conformal threshold at which the set of classes holds the true one in ``coverage`` of the
+    - ``sure``: the split-conformal threshold at which the set of classes holds the true one in `COVERAGE` of the
       labelled steps (least ambiguous sets: Sadinle, Lei and Wasserman 2019), with equal
       weights of people and of their recordings; the finite-sample correction counts recordings, because the steps of
       one recording are not independent.
-    - ``known_margin``: the smoothed known score that ``known_share`` of the same steps reach, without idle gestures.
+    - ``known_margin``: the smoothed known score that `KNOWN_SHARE` of the same steps reach, without idle gestures.
     - Gate: thresholds for a rate of false alarms on the streams of all people (`gate.fit_gate`).
     - Health: limits with which no sensor of these people is at fault.
 
@@ -202,10 +207,8 @@ def fit_decisions(
         spec: start of the search; ``keep`` names the settings not to change.
 
     Raises:
-        ConfigError: for a coverage or a share out of range.
         DatasetError: when ``subjects`` is empty.
     """
-    aims = _AnswerAims(coverage, known_share)
     spec, people = spec or DecideSpec(), sorted(set(subjects))
     if not people:
         raise DatasetError("Decision settings are fitted on people who were held back, and there are none.")
@@ -215,25 +218,20 @@ def fit_decisions(
         spec = replace(spec, health=health.settings)
     gate: dict[str, Any] = {}
     if "gate" not in keep:
-        fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
+        fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=FALSE_ALARMS_PER_HOUR)
         spec, gate = replace(spec, gate=fitted.settings), {"gate": fitted.report}
     streams = marked_streams(bundle, dataset, people, spec)
     report = {"people": len(people), **_described(streams, bundle.gestures), "simulated": dataset.head.simulated}
     if streams:
-        spec, report["events"] = _fit_events(bundle, dataset, streams, spec, aims, keep)
+        spec, report["events"] = _fit_events(bundle, dataset, streams, spec, keep)
         labelled = labelled_steps(bundle, streams, spec)
     else:
         labelled = labelled_windows(bundle, dataset, people)
         report["events"] = {"on": "nothing: nobody who was held back has a stream", "moved": {}}
     if len(labelled.truth):
-        spec = _fit_answers(labelled, spec, bundle.gestures, aims, keep)
-        report["answers"] = _answers(labelled, spec, aims, bool(streams))
-    report["health"] = {
-        "people": len(everybody),
-        "hours": round(health.seconds / 3600, 3),
-        "end_stops": list(health.widened),
-        "longest_still_ms": health.still_ms,
-    }
+        spec = _fit_answers(labelled, spec, bundle.gestures, keep)
+        report["answers"] = _answers(labelled, spec, bool(streams))
+    report["health"] = {"people": len(everybody), **health.to_json()}
     return replace(spec, fitted=report | gate)
 
 
@@ -247,31 +245,17 @@ def _described(streams: Sequence[MarkedStream], gestures: GestureSet) -> dict[st
     }
 
 
-@dataclass(frozen=True)
-class _AnswerAims:
-    """Share of the steps whose set of classes holds the true one, and of those that count as a known gesture."""
-
-    coverage: float
-    known_share: float
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0.5 <= value < 1.0:
-                raise ConfigError(f"{name} is {value!r}; accepted are shares from 0.5 to under 1.")
-
-
 def _fit_events(
     bundle: Bundle,
     dataset: Dataset,
     streams: Sequence[MarkedStream],
     spec: DecideSpec,
-    aims: _AnswerAims,
     keep: Collection[str],
 ) -> tuple[DecideSpec, dict[str, Any]]:
     """Return the event settings of least cost, and a report on the search."""
     if "known_margin" not in keep:
         labelled = labelled_steps(bundle, streams, spec)
-        spec = replace(spec, known_margin=known_threshold(labelled, bundle.gestures, aims.known_share))
+        spec = replace(spec, known_margin=known_threshold(labelled, bundle.gestures, KNOWN_SHARE))
     costs = ErrorCosts()
     if dataset.head.simulated or dataset.layout.is_labelled:
         # Nobody practises there between the marked gestures, so every event outside of them is false.
@@ -287,14 +271,12 @@ def _fit_events(
     return tuned.spec, report
 
 
-def _fit_answers(
-    labelled: LabelledSteps, spec: DecideSpec, gestures: GestureSet, aims: _AnswerAims, keep: Collection[str]
-) -> DecideSpec:
+def _fit_answers(labelled: LabelledSteps, spec: DecideSpec, gestures: GestureSet, keep: Collection[str]) -> DecideSpec:
     """Return the settings with the thresholds for known gestures and for the set of classes."""
     if "known_margin" not in keep:
-        spec = replace(spec, known_margin=known_threshold(labelled, gestures, aims.known_share))
+        spec = replace(spec, known_margin=known_threshold(labelled, gestures, KNOWN_SHARE))
     if "sure" not in keep:
-        spec = replace(spec, sure=sure_threshold(labelled, aims.coverage))
+        spec = replace(spec, sure=sure_threshold(labelled, COVERAGE))
     return spec
 
 
@@ -302,12 +284,12 @@ def _round(value: float) -> float | None:
     return round(value, 4) if np.isfinite(value) else None
 
 
-def _answers(labelled: LabelledSteps, spec: DecideSpec, aims: _AnswerAims, steps: bool) -> dict[str, Any]:
-    by_person = left_out_coverage(labelled, aims.coverage)
+def _answers(labelled: LabelledSteps, spec: DecideSpec, steps: bool) -> dict[str, Any]:
+    by_person = left_out_coverage(labelled, COVERAGE)
     people = len(set(labelled.person.tolist()))
     return {
         "on": "steps in the second half of a recording" if steps else "windows, not smoothed",
-        "coverage": aims.coverage,
+        "coverage": COVERAGE,
         "recordings": len(np.unique(labelled.recording)),
         # Coverage of each person with the threshold fitted to the others, as for a new person.
         "coverage_left_out": _round(float(np.mean(by_person))) if by_person else None,
@@ -315,7 +297,7 @@ def _answers(labelled: LabelledSteps, spec: DecideSpec, aims: _AnswerAims, steps
         # Largest share of new people for which n people can give a guarantee: n / (n + 1).
         "people_bound": _round(people / (people + 1)),
         "classes_in_set": _round(float((labelled.shares >= spec.sure * ONE).sum(axis=1).mean())),
-        "known_share": aims.known_share,
+        "known_share": KNOWN_SHARE,
     }
 
 

@@ -318,7 +318,7 @@ def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
     return [Signal(kind, group, lag, 0, slow, slower) for kind, group, lag in watched]
 
 
-def measure_gate(settings: GateSettings, material: Material, layout: Layout) -> dict[str, Any]:
+def measure_gate(settings: GateSettings, material: Material, layout: Layout) -> dict[str, object]:
     """Run the `Gate` on the material of some people; return a report as plain values.
 
     It has recall by gesture, false alarms per hour in calm recordings and between recordings, and the median time from

@@ -147,7 +147,7 @@ class TrainingScores:
     simulated: bool
     int8: DeployedScores | None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON, as bundles store them; the description has the key ``said``."""
         return {
             "split": self.split,

@@ -157,7 +157,7 @@ class LearningCurve:
     gain: float
     ci95: tuple[float, float]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         points = [{"people": people, "accuracy": accuracy} for people, accuracy in self.points]
         return asdict(self) | {"points": points, "ci95": list(self.ci95)}
@@ -231,7 +231,7 @@ class BudgetResult:
     cut: tuple[Mapping[str, Any], ...]
     seconds: float
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         paths = {name: str(getattr(self, name)) for name in ("bundle", "evaluation", "report")}
         learning = None if self.learning is None else self.learning.to_json()

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.index import open_dataset
@@ -72,7 +72,7 @@ class DemoResult:
     live: LiveSummary
     gestures: tuple[DemoGesture, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON; the decisions have the keys ``said`` and ``said_affect``."""
         scores = self.evaluation.to_json()
         keys = ("split", "context", "leaky", "accuracy", "macro_f1", "by_recording")

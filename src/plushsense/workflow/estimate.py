@@ -10,7 +10,6 @@ import os
 import time
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -54,7 +53,7 @@ class CostEstimate:
     window_epoch_s: float
     seconds: float
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return asdict(self)
 

@@ -183,7 +183,7 @@ class SavedWindows:
     bytes: int
     windows: dict[str, int]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the object that ``plushsense evaluate --save-windows --json`` prints."""
         return {"file": str(self.path), "bytes": self.bytes, "windows": self.windows}
 
@@ -254,7 +254,7 @@ class PatchResult:
     bytes: int
     image_check: int
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the object that ``plushsense export --patch-for --json`` prints."""
         return {"patch": str(self.path), "bytes": self.bytes, "image_check": self.image_check}
 

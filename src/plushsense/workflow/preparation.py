@@ -107,13 +107,13 @@ class Run:
         """Cut the windows to score (see `windows_for`)."""
         return windows_for(self.dataset, self.network, self.scored_on, self.gestures, warn)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return all settings as plain values for JSON."""
         names = ("windows", "model", "training", "evaluation", "live", "anywhere")
         tables = {name: asdict(getattr(self, name)) for name in names}
         return {"preset": self.preset, **tables, "training": self.training.to_dict()}
 
-    def outcome(self) -> dict[str, Any]:
+    def outcome(self) -> dict[str, dict[str, object]]:
         """Return the settings that an evaluation's scores depend on, as plain values for JSON."""
         evaluation = asdict(self.evaluation) | {"train_context": self.trained_on.context}
         del evaluation["workers"]

@@ -158,7 +158,7 @@ def evaluation_title(result: EvaluationResult, run: Run) -> str:
     return ", ".join(filter(None, (*parts, f"seed {run.training.seed}", run.changes)))
 
 
-def card(arch: Arch, **more: Any) -> dict[str, Any]:
+def card(arch: Arch, **more: Any) -> dict[str, object]:
     """Return the symbol and the counts of a network for a model card and the command line.
 
     With ``rate_hz`` among ``more``, receptive field and span are also given in seconds.

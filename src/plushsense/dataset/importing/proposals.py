@@ -138,7 +138,7 @@ class Sensor:
             )
         return text
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON."""
         values = asdict(self)
         del values["radius"]
@@ -176,7 +176,7 @@ class Proposal:
             return f"try  [windows] {self.setting}  in a --config file"
         return f"adopted {self.setting}" if self.adopted else f"give a layout with {self.setting}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON; ``groups`` only if there are any."""
         groups = {"groups": [sensor.to_json() for sensor in self.groups]} if self.groups else {}
         return {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.proposals import Proposal, Sensor
@@ -85,7 +84,7 @@ class ImportResult:
         """Notes and warnings."""
         return self.notes + self.warnings
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON."""
         return {
             "recordings": self.recordings,
@@ -141,7 +140,7 @@ class ImportPreview:
     proposals: tuple[Proposal, ...] = ()
     sensors: tuple[Sensor, ...] = ()
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON."""
         return {
             "layout": self.layout,

@@ -83,7 +83,7 @@ class ConvertedSource:
     more: dict[str, Any]
 
     @cached_property
-    def table(self) -> dict[str, Any]:
+    def table(self) -> dict[str, object]:
         """Content of ``origin.json``: the source, its SHA-256 and ``more``."""
         return {"source": self.display_name, "sha256": sha256_of(self.path)} | self.more
 

@@ -45,7 +45,7 @@ def cells(values: Sequence[Any]) -> NDArray[Any]:
     return column
 
 
-def parameters(bundle: Bundle) -> dict[str, Any]:
+def parameters(bundle: Bundle) -> dict[str, object]:
     """Return the variables of ``model.mat``: sizes are those of MATLAB's layers, values of windows in layout units."""
     arch, weights = bundle.arch, bundle.weights
     scaler = InputUnits.of(bundle.layout).scaler(bundle.scaler)

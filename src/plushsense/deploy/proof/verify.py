@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -99,7 +98,7 @@ class SettingResult:
     first: str | None = None
     cycles: Cycles | None = None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the result as plain values for JSON."""
         cycles = dict(vars(self.cycles)) if self.cycles else None
         return {**vars(self), "seconds": round(self.seconds, 2), "cycles": cycles}
@@ -142,7 +141,7 @@ class VerificationResult:
     def passed(self) -> bool:
         return self.mismatches == 0 and self.decisions > 0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the object that ``plushsense verify --json`` prints."""
         return {
             "title": self.title,

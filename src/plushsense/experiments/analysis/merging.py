@@ -222,7 +222,7 @@ def _scores(
 
 def _without_defaults(gestures: GestureSet) -> dict[str, Any]:
     """Return the table of a TOML file, without the keys that have their defaults."""
-    table = gestures.to_dict()
+    table: dict[str, Any] = gestures.to_dict()
     plain = vars(replace(Gesture("x"), family=""))
     rows = [{k: v for k, v in g.items() if k == "label" or v != plain[k]} for g in table["gestures"]]
     return {"name": table["name"], "gestures": rows}

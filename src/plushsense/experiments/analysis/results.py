@@ -88,7 +88,7 @@ class ComparedModel:
     rank: Mapping[str, float]
     calibration_error: float
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         e = self.evaluation
         return {
@@ -149,7 +149,7 @@ class PairedComparisonResult:
         """The name of the data set."""
         return self.models[0].evaluation.dataset
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             "models": [model.to_json() for model in self.models],
@@ -225,7 +225,7 @@ class MergeResult:
     people: int
     gestures: str | None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             "steps": [

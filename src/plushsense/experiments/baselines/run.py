@@ -282,7 +282,7 @@ def comparison_id(run: Run, spec: ComparisonSpec) -> str:
     Raises:
         ConfigError: for an unknown setting.
     """
-    outcome = {key: value for key, value in run.outcome().items() if key != "evaluation"}
+    outcome: dict[str, object] = {key: value for key, value in run.outcome().items() if key != "evaluation"}
     outcome |= {"seed": run.evaluation.seed, "classes": run.evaluation.classes}
     outcome |= {"splits": [parse_split(text).text for text in spec.splits], "models": chosen(spec.models)}
     outcome |= {"features": list(spec.features), "pca": spec.pca}

@@ -162,7 +162,7 @@ class ComparisonResult:
     models: tuple[ProgramScores, ...]
     gaps: tuple[ProgramGap, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values; the metrics of a row stand beside its other keys."""
         rows = {
             "splits": [dict(vars(split)) for split in self.splits],
@@ -188,7 +188,7 @@ class BaselinesResult(ComparisonResult):
     code_version: str
 
 
-def flat(row: ProgramScores | ProgramGap) -> dict[str, Any]:
+def flat(row: ProgramScores | ProgramGap) -> dict[str, object]:
     """Return the values of a row by name, with its metrics among them."""
     values: dict[str, Any] = {}
     for name, value in vars(row).items():

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import mean
-from typing import Any
 
 import numpy as np
 
@@ -366,7 +365,7 @@ class SummaryRow:
     system: str
     figures: TrialSummary
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, the figures beside what they are of."""
         of = {"group": self.group, "title": self.title} if self.gesture is None else {"gesture": self.gesture}
         return {**of, "system": self.system, **vars(self.figures)}
@@ -433,7 +432,7 @@ class ScoredTrials:
     between: tuple[StrayEvents, ...]
     outcomes: tuple[TrialOutcome, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             "people": list(self.people),
@@ -537,7 +536,7 @@ class ProtocolResult:
     engine: str
     files: tuple[str, ...] = ()
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             **self.scored.to_json(),

@@ -114,6 +114,21 @@ class StreamPredictions:
                         )
 
 
+def _read_rows(place: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Return the columns of a file of predictions, and its rows with their lines."""
+    try:
+        columns, rows = read_csv_rows(place, "predictions")
+    except FileNotFoundError:
+        raise FileFormatError(f"There is no file '{place}': give a CSV file of predictions.") from None
+    _check_columns(place, columns)
+    if not rows:
+        raise FileFormatError(
+            f"'{place}' has no rows below its header: give a row for each decision or event, and for a stream without "
+            "events one with an empty label."
+        )
+    return columns, rows
+
+
 def read_predictions(
     path: str | os.PathLike[str],
     gestures: GestureSet,
@@ -133,16 +148,7 @@ def read_predictions(
         FileFormatError: for the first row that cannot be used, with its line.
     """
     place = Path(path)
-    try:
-        columns, rows = read_csv_rows(place, "predictions")
-    except FileNotFoundError:
-        raise FileFormatError(f"There is no file '{place}': give a CSV file of predictions.") from None
-    _check_columns(place, columns)
-    if not rows:
-        raise FileFormatError(
-            f"'{place}' has no rows below its header: give a row for each decision or event, and for a stream without "
-            "events one with an empty label."
-        )
+    columns, rows = _read_rows(place)
     column = next((c for c in ("stream", "subject") if c in columns), None)
     named = _streams_by(column, streams, alone, place)
     idle = {g.label: NO_GESTURE for g in (*known.gestures, *gestures.gestures) if g.idle}

@@ -219,7 +219,7 @@ class StreamScore:
         """Return the pooled tally of all labels of a level."""
         return pooled(self.levels[level].values())
 
-    def to_journal(self) -> dict[str, Any]:
+    def to_journal(self) -> dict[str, object]:
         """Return plain values, as a journal stores them."""
         levels = {level: {k: t.kept() for k, t in tallies.items()} for level, tallies in self.levels.items()}
         return {**vars(self), "levels": levels, "places": dict(self.places)}
@@ -230,7 +230,7 @@ class StreamScore:
         levels = {level: {k: Tally(**t) for k, t in rows.items()} for level, rows in table["levels"].items()}
         return cls(**{**table, "levels": levels})
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the figures that reports show, ready for JSON."""
         gesture = self.total()
         counts = gesture.to_dict()

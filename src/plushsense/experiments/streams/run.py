@@ -50,6 +50,7 @@ from plushsense.experiments.streams.replay import (
 from plushsense.experiments.streams.score import (
     BenchmarkResult,
     Fitted,
+    Folds,
     PeopleFold,
     Settings,
     crossvalidated_streams,
@@ -94,7 +95,7 @@ class Recipe:
     gestures: GestureSet
     anywhere: AnywhereSpec | None = None
 
-    def key(self) -> dict[str, Any]:
+    def key(self) -> dict[str, object]:
         """Return the settings that a network depends on besides the data and the fold."""
         return {
             "arch": self.arch.to_dict(),
@@ -152,7 +153,7 @@ class TrainStreams:
         keep_bundle(bundle, path, dataset)
         return bundle
 
-    def key(self) -> dict[str, Any]:
+    def key(self) -> dict[str, object]:
         """Return the settings that the fit depends on besides the data and the fold."""
         return {
             "gate": str(GateSpec()) if self.gate else None,
@@ -268,7 +269,7 @@ class StreamEvalResult(ScoredStreams):
     trained_on: tuple[str, ...]
     spec: DecideSpec
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values: the figures over all people, and ``people`` with those of each."""
         rows = {who: {**one.to_dict(), "trained_on": who in self.trained_on} for who, one in self.scores.items()}
         settings = {k: v for k, v in self.spec.to_dict().items() if k not in ("gate", "health", "fitted")}
@@ -307,7 +308,7 @@ class PredictionsResult(ScoredStreams):
     classes: tuple[str, ...]
     streams: tuple[str, ...]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values: the figures over all people, and ``people`` with those of each."""
         table: dict[str, Any] = {**self.whole.to_dict(), "people": {p: one.to_dict() for p, one in self.scores.items()}}
         for row in (table, *table["people"].values()):
@@ -572,8 +573,19 @@ def stream_benchmark(
         seed=seed,
         progress=progress,
     )
+    result = _benchmark_result(run, dataset, spec, folds, recipes)
+    if out is not None:
+        with dataset.generation.writing():
+            save_benchmark(result, Path(out))
+    return result
+
+
+def _benchmark_result(
+    run: Run, dataset: Dataset, spec: BenchmarkSpec, folds: Folds, recipes: Mapping[str, Recipe]
+) -> BenchmarkResult:
+    """Add up the folds, and say what they were scored on."""
     tested = {person for fold in folds for person in fold["test"]}
-    result = BenchmarkResult(
+    return BenchmarkResult(
         **vars(summed(folds)),
         split=spec.split,
         dataset=dataset.head.name,
@@ -585,13 +597,9 @@ def stream_benchmark(
         labelled_stretches=len(dataset.stretches),
         subjects=sorted(tested & set(people_with_streams(dataset))),
         code_version=__version__,
-        seed=seed,
+        seed=run.evaluation.seed,
         networks={name: recipe.arch.title for name, recipe in recipes.items()},
         anywhere=dict(vars(run.anywhere)),
         preset=run.preset,
         training=run.training.to_dict(),
     )
-    if out is not None:
-        with dataset.generation.writing():
-            save_benchmark(result, Path(out))
-    return result

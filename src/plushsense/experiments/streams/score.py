@@ -131,7 +131,7 @@ class Settings:
     late_s: float = LATE_S
     weights: ErrorCosts = field(default_factory=ErrorCosts)
 
-    def key(self, gestures: GestureSet) -> dict[str, Any]:
+    def key(self, gestures: GestureSet) -> dict[str, object]:
         """Return the values that a stored fold depends on, including the settings that are tried."""
         grids = {}
         for name in self.systems:
@@ -388,7 +388,7 @@ def _outcome(folds: Folds, name: str, how: str) -> dict[str, Any]:
         for person, stored in sorted(fold["systems"][name][how]["people"].items()):
             mine = StreamScore.from_journal(stored)
             whole.add(mine)
-            figures = mine.to_dict()
+            figures: dict[str, Any] = mine.to_dict()
             people.append(
                 {"subject": person, "fold": fold["name"]}
                 | {k: figures[k] for k in ("truths", "events", "recall", "precision", "f1", "false_events_per_hour")}

@@ -129,7 +129,7 @@ class SweepFolder:
         ]
         return sorted(rows, key=lambda row: (row["run"], row["epochs"]))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Return the content of ``sweep.json``.
 
         Confusions are those of the best trials, and of the best of each filter set, of each kept network and of the two

@@ -168,7 +168,7 @@ class GridSpec:
                 found.append(Excess(value, limit, unit))
         return found
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, without newer settings that have their defaults, which keeps the ids of old grids."""
         usual = {field.name: field.default for field in fields(self)}
         return {key: value for key, value in asdict(self).items() if key not in _NEW or value != usual[key]}

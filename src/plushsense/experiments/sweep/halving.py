@@ -120,7 +120,7 @@ class HalvingCosts:
                 f"{_round_up(self.least):g}, or begin with fewer epochs."
             )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the bound, and what it is compared with, as plain values."""
         return {
             "networks": len(self._until),
@@ -258,7 +258,7 @@ class Halving:
             for name, table in tables.items()
         )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, as in ``sweep.json``."""
         equal = [self.networks[n][-1] for n in (self.found.best, *self.found.equals)]
         return {

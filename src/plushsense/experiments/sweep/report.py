@@ -226,7 +226,7 @@ class ReportResult:
         """What was written, in words."""
         return [f"{self.n_files} tables and figures in {self.files}"]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, ready for JSON."""
         return {
             "report": str(self.report),

@@ -319,7 +319,7 @@ class SweepPreview:
     seconds: float | None = None
     halving: HalvingCosts | None = None
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values: counts, cost in multiply-accumulates, memory of each process, settings, problems.
 
         ``training_mb`` (a step of the largest training) is None where PyTorch's own layers decide.

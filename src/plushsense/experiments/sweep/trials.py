@@ -74,7 +74,7 @@ class SweepHead:
             code_version=__version__,
         )
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values, as in ``sweep.json``."""
         return asdict(self) | {"grid": self.grid.to_json()}
 
@@ -129,7 +129,7 @@ class TrialResult:
         total: Counts = np.sum([scored.counts for scored in self.scored], axis=0, dtype=np.int64)
         return total
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> dict[str, object]:
         """Return the row in the table of trials, with every column; None where there is no value yet."""
         return {key: column.value(self) for key, column in TRIAL_COLUMNS.items()}
 

@@ -143,16 +143,18 @@ class Words:
 
     def _translated(self, message: str | Mapping[str, Any], quoted: str) -> str:
         if isinstance(message, str):
-            message = message.to_json() if isinstance(message, Message) else {"message": message}
-        template = message.get("template", "")
+            stored: Mapping[str, Any] = message.to_json() if isinstance(message, Message) else {"message": message}
+        else:
+            stored = message
+        template = stored.get("template", "")
         translation = self._translation(template) if template else ""
-        if not translation and self.language == next(iter(LANGUAGES)) and _has_message(message.get("values", {})):
+        if not translation and self.language == next(iter(LANGUAGES)) and _has_message(stored.get("values", {})):
             translation = template
         if translation:
             # A stored job of another version may lack a value.
             with suppress(KeyError):
-                return single_stops(_ValueFiller(self).vformat(str(translation), (), message["values"]))
-        text = str(message.get("message", ""))
+                return single_stops(_ValueFiller(self).vformat(str(translation), (), stored["values"]))
+        text = str(stored.get("message", ""))
         return self(quoted, message=text) if text and self.language != next(iter(LANGUAGES)) else text
 
     def unit(self, unit: str) -> str:

@@ -105,7 +105,7 @@ class ReviewPlot(Element, component="review_plot.js"):
 _DASHES: tuple[list[int], ...] = ([], [7, 4], [2, 3])
 
 
-def curve_styles(names: Sequence[str]) -> list[dict[str, Any]]:
+def curve_styles(names: Sequence[str]) -> list[dict[str, object]]:
     """Return label, colour and dashes of each curve, as `ReviewPlot.show` takes them."""
     return [
         {"label": n, "stroke": LINES[i % len(LINES)], "dash": _DASHES[i // len(LINES) % len(_DASHES)]}

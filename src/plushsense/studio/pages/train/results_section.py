@@ -299,7 +299,7 @@ def pareto_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
     return sorted((row for row, best in zip(scored, on_front, strict=True) if best), key=lambda row: row.parameters)
 
 
-def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, Any]:
+def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, object]:
     """Return the options of an ECharts plot of macro-F1 against parameters, for the SVG renderer.
 
     Leaky results are drawn as hollow diamonds and have the word in their labels.
