@@ -110,13 +110,9 @@ def classical(place: Workplace, seed: int | None) -> Figures:
 
 
 def personal(place: Workplace, seed: int | None) -> Figures:
-    found = place.plushsense(
-        "adapt", "--evaluate", place.made("makeability"), "--split", "by-subject:5", "--int8", "--seed", seed
-    )
-    scores = found["engines"]
+    found = place.plushsense("adapt", "--evaluate", place.made("makeability"), "--split", "by-subject:5", "--seed", seed)
     return {
-        f"{engine}_{score}_{when}": by_person(scores[engine][score][when])
-        for engine in ("float", "int8")
+        f"float_{score}_{when}": by_person(found[score][when])
         for score in ("accuracy", "macro_f1")
         for when in ("before", "after")
     }
@@ -341,7 +337,6 @@ ROWS: dict[str, Row] = {
         (
             line("accuracy before / after adapting", "float_accuracy_before float_accuracy_after", ".3f"),
             line("macro-F1 before / after", "float_macro_f1_before float_macro_f1_after", ".3f"),
-            line("macro-F1 in 8 bits, before / after", "int8_macro_f1_before int8_macro_f1_after", ".3f"),
         ),
         8,
         (0,),
