@@ -110,7 +110,9 @@ def classical(place: Workplace, seed: int | None) -> Figures:
 
 
 def personal(place: Workplace, seed: int | None) -> Figures:
-    found = place.plushsense("adapt", "--evaluate", place.made("makeability"), "--split", "by-subject:5", "--seed", seed)
+    found = place.plushsense(
+        "adapt", "--evaluate", place.made("makeability"), "--split", "by-subject:5", "--seed", seed
+    )
     return {
         f"float_{score}_{when}": by_person(found[score][when])
         for score in ("accuracy", "macro_f1")

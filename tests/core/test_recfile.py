@@ -17,6 +17,8 @@ from plushsense.core.recorder_csv import (
     write_recording,
 )
 
+pytestmark = pytest.mark.slow
+
 ACCEL = load_layout("accel-3")
 PLUSH = load_layout("plush-15")
 

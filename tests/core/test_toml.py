@@ -142,6 +142,7 @@ TABLES: list[tuple[type[Any], dict[str, Any]]] = [
 
 @settings(max_examples=100 * FUZZ, database=None)
 @given(st.sampled_from(TABLES), st.randoms(use_true_random=False))
+@pytest.mark.slow
 def test_any_layout_and_gesture_set_is_read_or_refused(
     given_table: tuple[type[Any], dict[str, Any]], rng: random.Random
 ) -> None:
@@ -159,6 +160,7 @@ def test_any_layout_and_gesture_set_is_read_or_refused(
 
 @settings(max_examples=100 * FUZZ, database=None)
 @given(st.sampled_from(TABLES), st.lists(st.tuples(st.integers(0, 1 << 20), st.binary(max_size=4)), max_size=4))
+@pytest.mark.slow
 def test_any_file_is_toml_or_refused(
     tmp_path_factory: pytest.TempPathFactory, table: tuple[type[Any], dict[str, Any]], cuts: list[tuple[int, bytes]]
 ) -> None:

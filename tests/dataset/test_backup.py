@@ -26,6 +26,8 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.privacy.forget import forget
 
+pytestmark = pytest.mark.slow
+
 ACCEL = load_layout("accel-3")
 
 

@@ -162,6 +162,7 @@ def test_a_disk_that_cannot_be_written_still_opens(folder: Path, monkeypatch: py
     assert len(open_dataset(folder).recordings) == 2
 
 
+@pytest.mark.slow
 def test_recordings_of_delays_are_found_in_their_stream(tmp_path: Path) -> None:
     simulate(tmp_path / "old", SimulationSpec(people=1, repetitions=1, at_rest=0, layout="plush-14"))
     done = import_recordings(tmp_path / "old", tmp_path / "DS", layout="plush-14")
@@ -287,6 +288,7 @@ def test_a_change_of_the_head_is_atomic_and_keeps_the_index(folder: Path, monkey
         ("\n", "\n,"),
     ],
 )
+@pytest.mark.slow
 def test_a_damaged_index_with_a_right_stamp_is_made_anew(folder: Path, old: str, new: str) -> None:
     expected = open_dataset(folder).recordings
     path = folder / "recordings.csv"

@@ -135,6 +135,7 @@ def test_setting_what_stands_adds_nothing_and_undo_brings_the_suggestion_back(da
     ("start", "stop", "said"),
     [(-0.1, None, "runs from 0 to 2.5"), (0.0, 2.6, "runs from 0"), (1.0, 1.0, "no row"), (float("nan"), 1.0, "nan")],
 )
+@pytest.mark.slow
 def test_times_that_cannot_be_are_refused(dataset: Dataset, start: float, stop: float | None, said: str) -> None:
     with pytest.raises(DatasetError, match=said):
         kept_rows(_waves(suggest_trims(dataset))[0], start, stop)

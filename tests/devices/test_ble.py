@@ -184,6 +184,7 @@ def take(device: BleDevice | ReconnectingDevice, frames: int) -> list[Any]:
 
 
 @pytest.mark.parametrize("sizes", [(20, 1, 7, 13), (1,), (244,)])
+@pytest.mark.slow
 def test_what_the_toy_says_is_read_however_it_is_cut(sizes: tuple[int, ...]) -> None:
     data = sent(600)
     parser = LineParser(PLUSH, joining=True)

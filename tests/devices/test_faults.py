@@ -194,6 +194,7 @@ CHECKS: dict[str, Callable[[Reading], None]] = {
 
 
 @pytest.mark.parametrize("kind", FAULTS)
+@pytest.mark.slow
 def test_a_fault_is_what_the_documents_say(kind: str, clean: Reading) -> None:
     CHECKS[kind](clean)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from plushsense.core.layouts import load_layout
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import LogPrompts, Prompt, ToySpec, ToyStream, VirtualDevice
@@ -59,6 +61,7 @@ def test_without_cues_it_plays_as_it_always_did() -> None:
     assert [line.data for line, _ in zip(ToyStream(with_noise, layout), range(3000), strict=False)] == plain
 
 
+@pytest.mark.slow
 def test_a_device_is_told() -> None:
     with open_device("virtual://?speed=0&lost=0&garbled=0") as device:
         assert isinstance(device, VirtualDevice)

@@ -16,6 +16,8 @@ from plushsense.devices.virtual.scenario import HumidityPoint, ScenarioPart, Toy
 from plushsense.devices.virtual.stream import Prompt, ToyLine, ToySpec, ToyStream, VirtualDevice
 from plushsense.devices.virtual.world import CHANNELS
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 PLUSH = load_layout("plush-15")
 QUIET = {"lost": 0.0, "garbled": 0.0, "glitch": 0.0}

@@ -83,6 +83,7 @@ def test_tcp_serves_every_line_and_the_truth() -> None:
     assert min(inside) > 2 * max(outside)
 
 
+@pytest.mark.slow
 def test_tcp_counts_what_the_line_loses() -> None:
     with (
         toy(over_tcp, ToySpec(lost=0.02, garbled=0.02), speed=0, seconds=120) as running,

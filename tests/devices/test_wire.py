@@ -15,6 +15,8 @@ from plushsense.devices.base import Counters, LossCounter
 from plushsense.devices.wire import LineParser, ParsedLine
 from support.sent_lines import format_line
 
+pytestmark = pytest.mark.slow
+
 PLUSH = load_layout("plush-15")
 OLD = load_layout("plush-14")
 ACCEL = load_layout("accel-3")

@@ -24,6 +24,8 @@ from plushsense.live.adaptation import (
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import softmax
 
+pytestmark = pytest.mark.slow
+
 Make = Callable[..., Bundle]
 SAMPLES = 48
 

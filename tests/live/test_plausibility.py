@@ -169,6 +169,7 @@ def test_another_rate_and_a_clock_that_stands_are_reported() -> None:
     assert reported(bundle, movement(2), period_ms=0.0)[0].startswith("The toy's clock stands still")
 
 
+@pytest.mark.slow
 def test_live_warns_and_sums_up(tmp_path: Path) -> None:
     bundle = bundle_of(HAND.for_vectors(), movement(1))
     values = movement(2, gravity=0.98)

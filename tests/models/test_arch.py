@@ -162,6 +162,7 @@ shapes = st.lists(st.tuples(numbers, st.integers(1, 9)), min_size=1, max_size=4)
 
 
 @given(shapes, st.sampled_from(PADDINGS), st.sampled_from(NORMS), st.integers(1, 20), st.integers(20, 400))
+@pytest.mark.slow
 def test_what_is_written_is_read_back(
     shape: list[tuple[int, int]], padding: str, norm: str, step: int, window: int
 ) -> None:
@@ -213,6 +214,7 @@ def test_default_kernels_last_as_long_at_other_rates() -> None:
         assert arch.parameters <= Arch.parse(DEFAULT_SYMBOL, (8, 12, 16)).parameters
 
 
+@pytest.mark.slow
 def test_a_network_is_shortened_to_what_a_window_holds() -> None:
     assert symbol_within(DEFAULT_SYMBOL, 122) == DEFAULT_SYMBOL
     assert symbol_within(VECTOR_SYMBOL, 30) == "v4_9d1_19d1"

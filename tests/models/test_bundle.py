@@ -82,6 +82,7 @@ def test_a_calibration_comes_back_and_a_bundle_without_one_is_written_as_before(
     assert Bundle.load(made).save(tmp_path / "again.plush").read_bytes() == made.read_bytes()
 
 
+@pytest.mark.slow
 def test_every_flipped_byte_is_noticed(tmp_path: Path) -> None:
     path = make().save(tmp_path / "m.plush")
     good = path.read_bytes()
@@ -242,6 +243,7 @@ DENSE = {"dense.weight": np.zeros((5, 4)).tolist(), "dense.bias": [0.0] * 5}
         ("arch", {**make().arch.to_dict(), "arch": "4096d4096_2d2"}),
     ],
 )
+@pytest.mark.slow
 def test_values_out_of_range_are_refused_at_load(where: str, value: object) -> None:
     content, weights = contents(make().to_bytes())
     table, *more = where.split(".")

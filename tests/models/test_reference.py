@@ -16,6 +16,8 @@ from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import NORMS, PADDINGS, PAPER_ARCHITECTURES, PAPER_FILTERS, Arch
 from plushsense.models.reference import Network, random_weights, softmax
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"channels": 3, "classes": 4, "window": 40}
 
 

@@ -71,6 +71,7 @@ def test_answers_do_not_depend_on_how_the_toy_is_held_but_on_the_sense_of_rotati
     assert np.abs(logits(back, np.eye(3)) - plain).max() > 0.05
 
 
+@pytest.mark.slow
 def test_both_engines_train_alike() -> None:
     """The gradient that the fast convolutions pass on to the layer is PyTorch's."""
     arch = arch_of(9, 2)

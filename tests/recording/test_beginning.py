@@ -54,6 +54,7 @@ def test_what_cannot_be(tmp_path: Path) -> None:
         check_speed(-1)
 
 
+@pytest.mark.slow
 def test_sessions_that_lie_there(tmp_path: Path) -> None:
     wanted = SessionRequest(URL, "S01", "quick")
     folder, _ = session_folder(tmp_path, wanted)

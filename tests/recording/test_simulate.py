@@ -23,6 +23,8 @@ from plushsense.devices.virtual.stream import ToySpec
 from plushsense.devices.virtual.world import draw_person
 from plushsense.recording.simulate import SimulationSpec, play_to_folder, repetitions_made, simulate
 
+pytestmark = pytest.mark.slow
+
 PLUSH = load_layout("plush-15")
 SCENARIO = Path(__file__).resolve().parents[2] / "examples" / "files" / "scenario.toml"
 

@@ -10,6 +10,8 @@ import pytest
 from plushsense.core.errors import ConfigError
 from plushsense.reports import figures
 
+pytestmark = pytest.mark.slow
+
 
 def test_confusion_shows_every_count_and_label_inside_the_picture(study):
     case = study["evaluations"][0]["confusion"]

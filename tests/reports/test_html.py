@@ -10,6 +10,8 @@ import pytest
 from plushsense.core.errors import ConfigError
 from plushsense.reports.evaluation import render, write_evaluation_report
 
+pytestmark = pytest.mark.slow
+
 VOID = {"meta", "img", "br"}
 
 

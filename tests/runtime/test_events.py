@@ -447,6 +447,7 @@ PLANS = st.builds(
 
 @settings(max_examples=80)
 @given(PLANS, SHARES, st.integers(5, 30), st.integers(0, 32767))
+@pytest.mark.slow
 def test_a_single_step_never_flips_a_hug_to_a_hit(
     settings: EventSettings, odd: dict[int, float], at: int, smoothing: int
 ) -> None:
@@ -463,6 +464,7 @@ def test_a_single_step_never_flips_a_hug_to_a_hit(
     st.lists(st.tuples(SHARES, st.integers(0, 19)), min_size=1, max_size=80),
     st.sampled_from([UNSMOOTHED, 9000]),
 )
+@pytest.mark.slow
 def test_events_follow_one_another_whatever_comes(settings: EventSettings, stream: list[Any], smoothing: int) -> None:
     """Begun, perhaps named once, ended; numbers go up by one; ``hold`` and ``rest`` are kept; what is said fits."""
     machine = EventMachine(settings, smoothing, SET)
@@ -528,6 +530,7 @@ def test_a_setting_that_the_toy_could_not_hold_is_refused(name: str, value: Any)
 
 
 @given(st.data())
+@pytest.mark.slow
 def test_many_steps_at_once_are_those_steps_one_by_one(data: st.DataObject) -> None:
     """`skip` and `stay` leave the machine as `follow` does."""
     machine = EventMachine(replace(SETTINGS, rest=3, wait=4, hold=2), UNSMOOTHED, SET)

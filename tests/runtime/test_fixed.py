@@ -22,6 +22,8 @@ from plushsense.runtime.fixed import (
     split_ratio,
 )
 
+pytestmark = pytest.mark.slow
+
 ONE = 1 << 15
 
 

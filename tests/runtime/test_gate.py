@@ -22,6 +22,8 @@ from plushsense.runtime.gate import (
 from plushsense.runtime.replay import firings, follow, raw_signals
 from plushsense.tuning.gate import signal_sizes
 
+pytestmark = pytest.mark.slow
+
 BLOW = Rule((Term(0, 32, times=2),), affect=3, gesture=255, within=3, deaf=5)
 LEVELS = GateSettings((Signal(LEVEL, (0,), floor=10),), (BLOW,))
 

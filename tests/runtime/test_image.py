@@ -51,6 +51,7 @@ class Reader:
 
 @settings(max_examples=25)
 @given(models(longest=300))
+@pytest.mark.slow
 def test_read_back(model: IntegerModel) -> None:
     """By the table of the module's docstring, and by nothing else."""
     image = model.to_bytes()

@@ -37,6 +37,7 @@ def samples_of(model: IntegerModel, n: int, seed: int) -> NDArray[np.int64]:
 
 @settings(max_examples=40)
 @given(models(longest=300) | models(longest=100, window=True), st.integers(0, 1 << 30))
+@pytest.mark.slow
 def test_a_window_and_a_stream_agree(model: IntegerModel, seed: int) -> None:
     """Whatever the sizes of the pieces in which the stream comes."""
     network, arch, rng = model.network, model.network.arch, np.random.default_rng(seed)
@@ -127,6 +128,7 @@ def unit_of(gravity: list[int]) -> list[int]:
 
 @settings(max_examples=15)
 @given(models(longest=130), st.integers(0, 1 << 30))
+@pytest.mark.slow
 def test_against_loops_of_plain_integers(model: IntegerModel, seed: int) -> None:
     """Every sum on its way fits 32 bits, or wraps once where the C lets it wrap: weights + 128."""
     network, arch = model.network, model.network.arch

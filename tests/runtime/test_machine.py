@@ -46,6 +46,7 @@ def expected(bundle, frames):
 
 @pytest.mark.parametrize("padding", ["stream", "causal", "mirror"])
 @pytest.mark.parametrize("layout", ["accel-3", "plush-15"])
+@pytest.mark.slow
 def test_decisions_are_those_of_whole_windows_across_gaps_and_resets(bundle, frames, padding, layout):
     model, source = bundle(padding, layout), frames(layout)
     found = decisions(StreamClassifier(model, OFF), source)

@@ -31,6 +31,8 @@ from plushsense.windows.features import Scaler, network_inputs
 from support.c_toy import Seat, compiled
 from support.troubles import SPECS, STREAMS, calibrate, knowing_bundle, make_bundle, toy_frames
 
+pytestmark = pytest.mark.slow
+
 TROUBLED = calibrate(make_bundle())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -18,6 +19,8 @@ from plushsense.runtime.replay import TraceReplayer, firings
 from plushsense.runtime.trace import Trace, replay, reported_events, trace_of
 from support.made_traces import GATE, STEP_S, made_trace
 from support.troubles import SPECS, STREAMS, make_bundle
+
+pytestmark = pytest.mark.slow
 
 
 def equal(replayer: TraceReplayer, rules: Rules, weight: int) -> bool:

@@ -21,6 +21,8 @@ from plushsense.runtime.replay import TraceReplayer
 from plushsense.runtime.trace import ReportedEvent, replay, reported_events, trace_of
 from support.troubles import SPECS, STREAMS, TROUBLES, calibrate, events_of, lived, make_bundle, reader_of, same, stream
 
+pytestmark = pytest.mark.slow
+
 ENGINES = ("float", "int8")
 BUNDLE = calibrate(make_bundle())
 GATES = GateSettings((Signal(JERK, (0, 1, 2), lag=2, floor=60),), (Rule((Term(0, 24),), 3, 255, deaf=12),))

@@ -24,6 +24,8 @@ from plushsense.scoring.events import (
     uncovered_s,
 )
 
+pytestmark = pytest.mark.slow
+
 HUG, HIT = "hug", "hit"
 FAMILIES = {"hug": "hold", "squeeze": "hold", "stroke": "stroke", "hit": "blow"}
 AFFECTS = {"hug": "positive", "squeeze": "positive", "stroke": "positive", "hit": "negative"}

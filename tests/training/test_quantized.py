@@ -64,6 +64,7 @@ def test_it_computes_what_the_toy_computes(padding: str, share: float, made: Mak
     assert np.abs(found - wanted).max() < share * np.abs(floats - wanted).max()
 
 
+@pytest.mark.slow
 def test_it_saves_a_network_that_plain_rounding_spoils(made: Make) -> None:
     network, windows, strangers = arch(), alike(made(240)), alike(made(150, seed=9))
     scaler, weights = Scaler.fit(windows.integers), spoilt(arch())

@@ -20,6 +20,7 @@ SPEC = TrainSpec(epochs=12, batch=16, learning_rate=0.01, halve_every=None, pati
 
 
 @pytest.mark.parametrize("both_ways", [False, True])
+@pytest.mark.slow
 def test_it_learns_and_the_seed_decides(made: Make, both_ways: bool) -> None:
     train, test = made(90), made(30, seed=8)
     once, again = (fit_recurrent(train, SPEC, 40, both_ways=both_ways, units=16) for _ in range(2))
@@ -75,6 +76,7 @@ def test_dropout_acts_in_training_only_before_the_dense_layer_and_between_layers
     assert torch.equal(net(x), net(x)) and not bool((given[-1] == 0).any())
 
 
+@pytest.mark.slow
 def test_units_layers_and_dropout_count_and_the_seed_decides_the_dropout(made: Make) -> None:
     train, test = made(60), made(20, seed=3)
     spec = replace(SPEC, epochs=2)

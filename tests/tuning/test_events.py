@@ -112,6 +112,7 @@ def flickering(people=3, gestures=30):
     return out
 
 
+@pytest.mark.slow
 def test_the_search_learns_to_pass_over_what_flickers_and_keeps_what_tells_nothing():
     start = DecideSpec(smoothing_s=0.05, enter=0.5, leave=0.3, least_s=0.05, end_s=0.05, rest_s=0.0, hold_s=0.0)
     streams = flickering()

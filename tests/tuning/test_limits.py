@@ -78,6 +78,7 @@ def test_where_people_touch_the_end_stop_only_staying_there_is_wrong(made):
     assert faults(fit.settings, hung) == 1
 
 
+@pytest.mark.slow
 def test_an_end_stop_that_people_reach_is_believed(made):
     reaching = touched(0, 40_000)
     reaching[5000:5030, 1] = 30_000  # 0.3 s, more than half of what makes a fault; too rare for the quantile

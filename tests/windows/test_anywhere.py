@@ -215,6 +215,7 @@ def test_a_gesture_called_idle_that_is_not_is_refused(tmp_path: Path) -> None:
         add_idle_gesture(data.gestures, data)
 
 
+@pytest.mark.slow
 def test_no_split_lets_a_training_window_touch_what_is_tested(tmp_path: Path) -> None:
     for who in ("ana", "ben", "cleo", "dora"):
         person(tmp_path / "src" / who, {(500, 200): "Wave", (900, 100): "Shake", (1300, 100): "Wave"})

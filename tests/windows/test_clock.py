@@ -11,6 +11,8 @@ from plushsense.core.recorder_csv import Frames
 from plushsense.core.row_times import kept_rows
 from plushsense.windows.clock import SampleClock, resample, row_times_us
 
+pytestmark = pytest.mark.slow
+
 ACCEL = load_layout("accel-3")
 
 

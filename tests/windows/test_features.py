@@ -15,6 +15,7 @@ LIMIT = magnitude_limit(3)
 
 
 @given(st.lists(st.integers(-LIMIT, LIMIT) | st.sampled_from([LIMIT, -LIMIT]), min_size=3, max_size=3))
+@pytest.mark.slow
 def test_magnitude_is_the_exact_floor(parts: list[int]) -> None:
     assert int(magnitude(np.array([parts]))[0]) == math.isqrt(sum(v * v for v in parts) << 8)
 

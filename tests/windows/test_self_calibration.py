@@ -24,6 +24,8 @@ from plushsense.windows.features import network_inputs
 from plushsense.windows.self_calibration import UNIT, SelfCalibration
 from plushsense.windows.sessions import SessionReader
 
+pytestmark = pytest.mark.slow
+
 PLAIN = load_layout("accel-3")
 WIDE = tuple(replace(c, valid_min=-262144.0, valid_max=262143.0) for c in PLAIN.channels)
 LAYOUT = replace(PLAIN, channels=WIDE, self_calibration=("x", "y", "z"))

@@ -74,6 +74,7 @@ def test_recordings_at_the_top_are_of_the_person_that_the_zip_names(tmp_path: Pa
         ("__MACOSX/ana/._Shake_1_60.csv", "macOS"),
     ],
 )
+@pytest.mark.slow
 def test_a_member_that_must_not_be_written_is_refused(tmp_path: Path, name: str, said: str) -> None:
     (tmp_path / "in").mkdir()
     with zipfile.ZipFile(tmp_path / "in" / "x.zip", "w") as archive:

@@ -16,6 +16,8 @@ from plushsense.dataset.importing.guessing import GuessedPattern, guess_pattern
 from plushsense.dataset.importing.importers import preview_import
 from plushsense.dataset.importing.results import ImportPreview
 
+pytestmark = pytest.mark.slow
+
 GESTURES = ("hug", "tap")
 
 

@@ -217,6 +217,7 @@ def test_har_phone_imports_whole(real_data: Path, tmp_path: Path) -> None:
     assert sum(r.rows for r in done.dataset.recordings) == sum(s.rows for s in done.dataset.streams)
 
 
+@pytest.mark.slow
 def test_a_simulation_stays_marked(tmp_path: Path) -> None:
     from plushsense.recording.simulate import SimulationSpec, simulate
 

@@ -20,6 +20,8 @@ from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.store import PersonInfo, read_people, write_people
 from plushsense.recording.writer import SessionEvent
 
+pytestmark = pytest.mark.slow
+
 Writer = Callable[..., Path]
 ACCEL = load_layout("accel-3")
 

@@ -84,6 +84,7 @@ def test_what_a_crash_left_is_named_and_no_fault(tmp_path: Path, session_writer:
         (b'{"format": 1, "subject": " ", "session": "1", "started_ms": 1, "layout": {}, "protocol": {}}', "no subject"),
     ],
 )
+@pytest.mark.slow
 def test_a_damaged_head_rejects_its_session_alone(
     tmp_path: Path, session_writer: Writer, head: bytes, said: str
 ) -> None:

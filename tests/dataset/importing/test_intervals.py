@@ -36,6 +36,7 @@ def cuts(done: ImportResult) -> list[tuple[str, int, int]]:
         ("start,end,label", ["1,3,hug", "3,4,hug", "5,6,tap"], 70000),
     ],
 )
+@pytest.mark.slow
 def test_intervals_beside_samples_are_found_and_cut_recordings(
     tmp_path: Path, header: str, rows: list[str], first_ms: int
 ) -> None:

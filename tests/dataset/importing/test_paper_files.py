@@ -18,6 +18,8 @@ from plushsense.dataset.quality.checking import check
 from support import paper_scripts as scripts
 from support.real_times import as_if_real
 
+pytestmark = pytest.mark.slow
+
 RECORDINGS = 3 * len(scripts.GESTURES) * 2
 
 

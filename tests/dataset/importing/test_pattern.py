@@ -20,6 +20,8 @@ from plushsense.dataset.importing.results import ImportResult
 from plushsense.dataset.quality.checking import check
 from support.foreign_folders import FOLDERS, PATTERNS
 
+pytestmark = pytest.mark.slow
+
 LAYOUT = {
     "rate_hz": 100.0,
     "channels": [{"name": name, "unit": "", "kind": "sensor"} for name in ("a", "b")],

@@ -16,6 +16,8 @@ from plushsense.windows.cut import WindowSpec, cut_windows
 from support import paper_scripts as scripts
 from support.matlab_files import write_mat
 
+pytestmark = pytest.mark.slow
+
 RECORDINGS = 3 * len(scripts.GESTURES) * 2
 
 

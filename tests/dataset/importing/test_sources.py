@@ -82,6 +82,7 @@ def test_a_data_set_is_no_source(tmp_path: Path) -> None:
     assert done.dataset.subjects == ["ana", "ben"]
 
 
+@pytest.mark.slow
 def test_a_simulation_is_known_from_above_below_and_its_head(tmp_path: Path) -> None:
     simulate(tmp_path / "a" / "virtual", SimulationSpec(people=1, repetitions=1, at_rest=0, gestures=("Tail pull",)))
     deep = tmp_path / "a" / "virtual" / "x" / "y"

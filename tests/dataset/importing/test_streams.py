@@ -16,6 +16,8 @@ from plushsense.scoring.splits import make_folds, parse_split
 from plushsense.windows.cut import WindowSpec, cut_windows
 from support import paper_scripts as scripts
 
+pytestmark = pytest.mark.slow
+
 Places = dict[tuple[str, int], tuple[str, str, int]]
 """Person, stream and row of each recording, by its gesture and the time of its first row."""
 

@@ -50,6 +50,7 @@ def rows_of(done: ImportResult) -> list[int]:
     "between",
     [("",), ("", ""), ("  ",), (",",), (",,,",), (HEAD,), ("# take",), ("// take", ""), ("-----",), ("", "x", HEAD)],
 )
+@pytest.mark.slow
 def test_lines_between_blocks_of_rows_end_a_recording(tmp_path: Path, between: tuple[str, ...]) -> None:
     done = imported(tmp_path, ["", *joined([block(40), block(50), block(30)], *between), ",", ""])
     assert rows_of(done) == [40, 50, 30]
@@ -107,6 +108,7 @@ def test_a_guess_says_that_files_hold_blocks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("clock", [[f"{1.5e12:.5E}"] * 120, [f"{np.float32(1.7e9 + k / 100):.1f}" for k in range(120)]])
+@pytest.mark.slow
 def test_no_unit_is_guessed_from_a_clock_that_stands_still(tmp_path: Path, clock: list[str]) -> None:
     (tmp_path / "src").mkdir()
     rows = [f"P{p},{t},{'Pat' if k < 60 else 'Hit'},{k * (6 + p) % 17}.5" for p in (1, 2) for k, t in enumerate(clock)]
@@ -161,6 +163,7 @@ def test_times_in_another_unit_than_their_name_says(tmp_path: Path) -> None:
         (lambda k: f"2026-03-01 12:00:{k // 100:02}.{k % 100:02}0", "iso"),
     ],
 )
+@pytest.mark.slow
 def test_clocks_of_spreadsheets(tmp_path: Path, clock: Callable[[int], str], unit: str) -> None:
     guessed, _ = guess_table(tmp_path, clock)
     assert guessed["time_unit"] == unit and guessed["layout"]["rate_hz"] == pytest.approx(100.0, rel=0.01)

@@ -20,6 +20,8 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.importing.xdf import complete_chunks, person_and_session
 from plushsense.devices.lsl import MARKERS
 
+pytestmark = pytest.mark.slow
+
 ACCEL = load_layout("accel-3")
 PLUSH = load_layout("plush-15")
 Writer = Callable[..., Path]

@@ -29,6 +29,8 @@ from plushsense.dataset.privacy import forget as room
 from plushsense.dataset.privacy.forget import FORGOTTEN, UNDER_WAY, RemovalRecord, forget, plan_removal, read_removals
 from plushsense.dataset.store import read_people, writing_around
 
+pytestmark = pytest.mark.slow
+
 ACCEL = load_layout("accel-3")
 INDEX = {"recordings.csv", "streams.csv", "index.json"}
 

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -245,15 +246,16 @@ def test_a_long_training_goes_on_where_it_was_stopped(
     shutil.rmtree(dataset.path / "cache" / JOURNAL)
     real, begun = room.fit, []
 
-    def fit(*given: Any, start: Any, save: Any, **more: Any) -> Any:
-        begun.append(0 if start is None else start.epoch)
+    def fit(*given: Any) -> Any:
+        *most, store = given
+        begun.append(0 if store.start is None else store.start.epoch)
 
         def stop(state: Any) -> None:
-            save(state)
+            store.save(state)
             if state.epoch == 4 and len(begun) == 1:
                 raise KeyboardInterrupt
 
-        return real(*given, start=start, save=stop, save_every_s=0.0, **more)
+        return real(*most, replace(store, save=stop, save_every_s=0.0))
 
     monkeypatch.setattr(room, "fit", fit)
     with pytest.raises(KeyboardInterrupt):
@@ -271,7 +273,7 @@ def test_a_state_that_cannot_be_kept_stops_no_training(
 ) -> None:
     from plushsense.training import fit as room
 
-    monkeypatch.setattr(room, "fit", partial(room.fit, save_every_s=0.0))
+    monkeypatch.setattr(room, "StoreSpec", partial(room.StoreSpec, save_every_s=0.0))
     (dataset.path / "cache").mkdir(parents=True)
     (dataset.path / "cache" / UNFINISHED).write_text("a file where the folder would be")
     assert sweep(dataset, epochs=(1, 2), out=tmp_path, **SMALL).head["done"] == 8
