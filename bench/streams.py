@@ -20,7 +20,7 @@ from typing import Any
 
 import plushsense as ps
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
+from plushsense.experiments.streams.benchmark import BenchmarkSpec, stream_benchmark
 from plushsense.experiments.streams.score import CHOICES
 from plushsense.experiments.streams.systems import ANYWHERE
 from plushsense.workflow.config import from_settings

@@ -25,11 +25,11 @@ import numpy as np
 
 import plushsense as ps
 from plushsense.core.errors import PlushSenseError
-from plushsense.experiments.baselines.run import ComparisonSpec, baselines
+from plushsense.experiments.baselines.run_baselines import ComparisonSpec, baselines
 from plushsense.experiments.baselines.score import UNSCALED, Pca, reads
 from plushsense.experiments.sweep.grid import CHOSEN
-from plushsense.experiments.sweep.report import training_settings
-from plushsense.experiments.sweep.run import SweepSpec, sweep
+from plushsense.experiments.sweep.run_sweep import SweepSpec, sweep
+from plushsense.experiments.sweep.sweep_page import training_settings
 from plushsense.experiments.sweep.tables import TABLE4
 from plushsense.scoring.splits import make_folds, parse_split
 from plushsense.windows.cut import WindowSpec

@@ -27,7 +27,7 @@ import plushsense as ps
 from plushsense.cli.main import main, parser_of
 from plushsense.cli.options import VERBS
 from plushsense.deploy.proof.verify import Setting
-from plushsense.experiments.baselines.run import chosen
+from plushsense.experiments.baselines.run_baselines import chosen
 from plushsense.live.adaptation import DENSE
 from plushsense.models.bundle import Bundle
 from plushsense.recording.simulate import SimulationSpec, simulate

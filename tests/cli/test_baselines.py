@@ -12,7 +12,7 @@ import pytest
 
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.baselines.run import MODELS, SETS, chosen
+from plushsense.experiments.baselines.run_baselines import MODELS, SETS, chosen
 
 Cli = Callable[..., Any]
 

@@ -250,7 +250,7 @@ def test_bad_input_is_one_sentence_and_status_2(
         (["check", "DS", "--save-labels", "FILE"], "dataset.labelling.decide_labels", "is not a file of labels"),
         (
             ["stream-eval", "DS", "--model", "BUNDLE", "--events", "FILE"],
-            "experiments.streams.run.streams_at",
+            "experiments.streams.benchmark.opened",
             "is not a file of events",
         ),
         (

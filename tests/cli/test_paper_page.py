@@ -126,7 +126,7 @@ def run_all() -> None:
         patch.setattr(os, "cpu_count", lambda: 1)
         patch.setattr("plushsense.recording.simulate.GESTURES", GESTURES)
         fewer = functools.partial(virtual_sittings, gestures=GESTURES)
-        patch.setattr("plushsense.experiments.protocol.run.virtual_sittings", fewer)
+        patch.setattr("plushsense.experiments.protocol.run_protocol.virtual_sittings", fewer)
         patch.setattr("plushsense.deploy.proof.verify.settings_of", lambda name: [Setting(name, "gcc", "-O2")])
         patch.setattr(serve, "run", lambda *given, **options: served.append(given))
         make_archive(Path("made").absolute()).rename("ARCHIVE")

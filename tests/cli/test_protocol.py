@@ -136,7 +136,7 @@ def test_the_old_rules_are_tuned_on_people_who_are_not_scored(capsys, sessions, 
 
 
 def test_virtual_rules_are_tuned_on_another_population():
-    from plushsense.experiments.protocol.run import virtual_rules
+    from plushsense.experiments.protocol.run_protocol import virtual_rules
     from plushsense.experiments.protocol.sittings import virtual_sittings
 
     layout, gestures = load_layout("plush-15"), load_gestures("plush-18")

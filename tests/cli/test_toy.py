@@ -13,7 +13,7 @@ import pytest
 
 from plushsense.deploy.quantize import classifier_of
 from plushsense.devices.opening import open_device
-from plushsense.experiments.streams.run import stream_eval
+from plushsense.experiments.streams.benchmark import stream_eval
 from plushsense.live.loop import run_live
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import NO_GESTURE

@@ -185,7 +185,7 @@ def test_what_the_test_of_the_source_finds(source: str, found: int) -> None:
 
 
 # Modules that fill tables and pictures, where an empty cell is empty.
-_TABLES = ("reports/", "/report.py", "/explanation_report.py", "/figures.py", "/tables.py", "studio/pages/")
+_TABLES = ("reports/", "_page.py", "/figures.py", "/tables.py", "studio/pages/")
 
 
 def test_every_list_in_a_sentence_has_words_for_an_empty_one() -> None:

@@ -86,7 +86,8 @@ DRILLS = {
     "check": Drill("check DIR/DS --json", lambda place, ran: (ran.json["findings"], data_set("DS")(place, ran))),
     "evaluate": Drill(f"evaluate DIR/DS --filters 2,3,3 --split by-subject:2 {SHORT}", evaluated),
     "sweep": Drill(
-        f"sweep DIR/DS --architectures 126d2,83d1_84d2 --filters 4,6,8,8 --batches full --split by-subject:2 {SHORT}",
+        "sweep DIR/DS --set architectures=126d2,83d1_84d2 --set filters=4,6,8,8 --set batches=full --set context=loop "
+        "--split by-subject:2 --epochs 1 --workers 1 --json",
         swept,
     ),
     "publish": Drill(

@@ -38,7 +38,7 @@ _PRELOADED = (
     *(
         "plushsense.cli.main",
         "plushsense.workflow.api",
-        "plushsense.experiments.sweep.run",
+        "plushsense.experiments.sweep.run_sweep",
         "plushsense.deploy.package",
     ),
     *("plushsense.dataset.publishing.package", "pytest", "torch"),

@@ -8,8 +8,8 @@ from typing import Any
 
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.sweep.results import SweepResult
-from plushsense.experiments.sweep.run import SweepProgress, SweepSpec
-from plushsense.experiments.sweep.run import sweep as sweep_spec
+from plushsense.experiments.sweep.run_sweep import SweepProgress, SweepSpec
+from plushsense.experiments.sweep.run_sweep import sweep as sweep_spec
 
 _WHERE = ("out", "overwrite", "workers", "cluster")
 

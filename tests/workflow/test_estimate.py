@@ -8,7 +8,7 @@ import pytest
 
 import plushsense as ps
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.sweep.run import SweepSpec, preview
+from plushsense.experiments.sweep.run_sweep import SweepSpec, preview
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.estimate import PASSES, preview_evaluation, preview_training
 from plushsense.workflow.preparation import prepare

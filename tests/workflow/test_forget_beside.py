@@ -19,8 +19,8 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.adaptation import evaluate_adapting
-from plushsense.experiments.baselines.run import ComparisonSpec, baselines
-from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
+from plushsense.experiments.baselines.run_baselines import ComparisonSpec, baselines
+from plushsense.experiments.streams.benchmark import BenchmarkSpec, stream_benchmark
 from plushsense.workflow.api import unfinished
 from plushsense.workflow.datasets import PublishSpec, share_copy
 from support.sweeping import sweep

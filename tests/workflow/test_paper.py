@@ -16,7 +16,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import parse_name, read_recording
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.baselines.models import BASELINES
-from plushsense.experiments.baselines.run import BaselinesResult, ComparisonSpec, baselines
+from plushsense.experiments.baselines.run_baselines import BaselinesResult, ComparisonSpec, baselines
 
 TESTS = Path(__file__).resolve().parents[1]
 

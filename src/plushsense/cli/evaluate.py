@@ -104,7 +104,7 @@ def deployed(e: dict[str, Any]) -> list[str]:
 
 
 def run_report(args: argparse.Namespace) -> int:
-    from plushsense.experiments.sweep.report import is_sweep
+    from plushsense.experiments.sweep.sweep_page import is_sweep
     from plushsense.workflow.reporting import write_report
 
     if is_sweep(args.out):
@@ -125,7 +125,7 @@ def run_report(args: argparse.Namespace) -> int:
 
 
 def _sweep_report(args: argparse.Namespace) -> int:
-    from plushsense.experiments.sweep.report import write_sweep_report
+    from plushsense.experiments.sweep.sweep_page import write_sweep_report
 
     if args.dataset or args.evaluation or args.model or args.recording:
         raise ConfigError(
@@ -138,7 +138,7 @@ def _sweep_report(args: argparse.Namespace) -> int:
 
 def run_baselines(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
-    from plushsense.experiments.baselines.run import PAGE, ComparisonSpec, baselines, comparison_id
+    from plushsense.experiments.baselines.run_baselines import PAGE, ComparisonSpec, baselines, comparison_id
     from plushsense.workflow.preparation import prepare
 
     config = settings(args, workers=args.workers)
@@ -163,7 +163,7 @@ def run_baselines(args: argparse.Namespace) -> int:
 
 def _baseline_lines(result: BaselinesResult) -> list[str]:
     """Format the comparison as text: a table with one line per model, with explanations."""
-    from plushsense.experiments.baselines.report import (
+    from plushsense.experiments.baselines.baselines_page import (
         COUNTS,
         LEAKY,
         describe_costs,

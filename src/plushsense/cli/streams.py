@@ -16,7 +16,7 @@ from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.experiments.protocol.score import ProtocolResult
-    from plushsense.experiments.streams.run import PredictionsResult, StreamEvalResult
+    from plushsense.experiments.streams.benchmark import PredictionsResult, StreamEvalResult
     from plushsense.experiments.streams.score import BenchmarkResult
 
 
@@ -36,7 +36,7 @@ def run_stream_eval(args: argparse.Namespace) -> int:
         return _run_split(args)
     if args.out or args.systems:
         raise ConfigError("--out and --systems belong to --split: leave them out, or give --split.")
-    from plushsense.experiments.streams.run import score_predictions, stream_eval
+    from plushsense.experiments.streams.benchmark import score_predictions, stream_eval
 
     people: dict[str, Any] = {"subjects": None if args.subjects is None else listed(args.subjects)}
     people |= {"late_s": args.late, "labels": args.labels == "use", "warn": warn}
@@ -52,7 +52,7 @@ def run_stream_eval(args: argparse.Namespace) -> int:
 
 
 def _run_split(args: argparse.Namespace) -> int:
-    from plushsense.experiments.streams.run import PAGE, BenchmarkSpec, stream_benchmark
+    from plushsense.experiments.streams.benchmark import PAGE, BenchmarkSpec, stream_benchmark
 
     if args.subjects:
         raise ConfigError("--subjects belongs to --model and --predictions: a split scores all people.")
@@ -142,7 +142,7 @@ def _format_scores(result: dict[str, Any]) -> list[str]:
 
 def _format_systems(result: BenchmarkResult) -> list[str]:
     """Format the scores of the systems as text: a row for each setting, then false events at equal recall."""
-    from plushsense.experiments.streams.report import SETTINGS
+    from plushsense.experiments.streams.benchmark_page import SETTINGS
 
     rows = [
         (system["title"], how, *_row(system[how]))
@@ -173,7 +173,7 @@ def _format_systems(result: BenchmarkResult) -> list[str]:
 
 
 def run_protocol(args: argparse.Namespace) -> int:
-    from plushsense.experiments.protocol.run import VirtualPeople, protocol
+    from plushsense.experiments.protocol.run_protocol import VirtualPeople, protocol
 
     virtual = options(args, "people", "first", "seed", "repetitions")
     virtual = {name: value for name, value in virtual.items() if value is not None}
@@ -194,7 +194,7 @@ def run_protocol(args: argparse.Namespace) -> int:
 
 def _protocol_lines(result: ProtocolResult) -> list[str]:
     """Format the outcome of the protocol as text: the table and the notes."""
-    from plushsense.experiments.protocol.report import SIMULATION, between_table, group_table
+    from plushsense.experiments.protocol.protocol_page import SIMULATION, between_table, group_table
 
     out = [result.heading, *([SIMULATION] if result.simulated else [])]
     out += [f"{name}: {value}" for name, value in result.about]

@@ -13,7 +13,7 @@ from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
     from plushsense.experiments.sweep.results import SweepResult
-    from plushsense.experiments.sweep.run import SweepPreview
+    from plushsense.experiments.sweep.run_sweep import SweepPreview
     from plushsense.reports.table import Row
 
 _KEYS = ("split", "epochs", "share", "eta", "max_parameters", "max_state_bytes", "max_macs_per_step")
@@ -23,7 +23,7 @@ _NAMED = ("name", "architectures", "filters", "split", "seeds")
 
 
 def run_sweep(args: argparse.Namespace) -> int:
-    from plushsense.experiments.sweep.run import SweepSpec, preview, sweep
+    from plushsense.experiments.sweep.run_sweep import SweepSpec, preview, sweep
 
     spec = SweepSpec(
         args.grid, _changes(args), args.out, args.force, args.workers or 0, args.cluster, args.keep_predictions

@@ -360,7 +360,7 @@ def _evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 def _sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Run a sweep; return the folder ``out`` and main values of the result, or the preview for a dry run."""
-    from plushsense.experiments.sweep.run import SweepProgress, SweepSpec, preview, sweep
+    from plushsense.experiments.sweep.run_sweep import SweepProgress, SweepSpec, preview, sweep
 
     asked = SweepSpec(spec["grid"], spec.get("changes", {}))
     if spec.get("dry"):

@@ -118,8 +118,9 @@ def test_a_merged_set_is_trained_scored_and_exported(cli: Cli, dataset: Dataset,
     step = next(step for step in steps if step["merges"] == 1)
     assert (scored["name"], scored["classes"], scored["scores"]) == (str(file), 2, step["scores"])
     assert (tmp_path / "n.toml").read_text(encoding="utf-8") == text
-    network = ("--architectures", "9", "--filters", "2", "--epochs", "1", "--batches", "4", "--workers", "1")
-    swept = cli("sweep", dataset.path, *network, "--classes", file, "--json")
+    network = ("architectures=9", "filters=2", "batches=4", f"classes={file}")
+    options = [word for change in network for word in ("--set", change)]
+    swept = cli("sweep", dataset.path, *options, "--epochs", "1", "--workers", "1", "--json")
     assert swept.status == 0 and tuple(swept.json["labels"]) == merged.labels, swept.err
     nothing = cli("merge", dataset.path, tmp_path / "E", "--groups", "plush-13", "--out", tmp_path / "no.toml")
     assert nothing.status == 2 and "'plush-13' merges none of the 3 gestures of the evaluation" in nothing.err

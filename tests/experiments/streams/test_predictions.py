@@ -17,9 +17,9 @@ from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import load_layout
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
+from plushsense.experiments.streams.benchmark import score_predictions, stream_eval
 from plushsense.experiments.streams.predictions import StreamPredictions, read_predictions
 from plushsense.experiments.streams.replay import read_streams, scored_streams, truth_of
-from plushsense.experiments.streams.run import score_predictions, stream_eval
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights

@@ -11,7 +11,7 @@ import pytest
 import plushsense as ps
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.streams.run import TrainStreams, recipes_for
+from plushsense.experiments.streams.benchmark import TrainStreams, recipes_for
 from plushsense.experiments.streams.score import PeopleFold
 from plushsense.experiments.streams.systems import ANYWHERE, WINDOWS
 from plushsense.training import fit as fitting

@@ -175,7 +175,7 @@ class ComparisonResult:
 
 @dataclass(frozen=True)
 class BaselinesResult(ComparisonResult):
-    """The result of `plushsense.experiments.baselines.run.baselines`: that of `compare`, and what it was made of."""
+    """The result of `run_baselines.baselines`: that of `compare`, and what it was made of."""
 
     dataset: str
     dataset_hash: str

@@ -20,7 +20,7 @@ import numpy as np
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.dataset.index import open_dataset
 from plushsense.devices.base import Frame
-from plushsense.experiments.protocol.run import RESULT, live_protocol
+from plushsense.experiments.protocol.run_protocol import RESULT, live_protocol
 from plushsense.experiments.protocol.sittings import GestureTrial, Sitting
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.toys import TappedDevice
@@ -177,7 +177,7 @@ class Validation:
         return [p.parent for p in sorted(found, key=lambda p: -p.stat().st_mtime)]
 
     def read(self, folder: Path) -> dict[str, Any]:
-        """Return a result, as `plushsense.experiments.protocol.run.live_protocol` wrote it."""
+        """Return a result, as `plushsense.experiments.protocol.run_protocol.live_protocol` wrote it."""
         path = self._workspace.inside(folder) / RESULT
         try:
             result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

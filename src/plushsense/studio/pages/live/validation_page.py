@@ -11,7 +11,7 @@ from typing import Any
 
 from nicegui import ui
 
-from plushsense.experiments.protocol.run import PAGE, TABLE, TRIALS
+from plushsense.experiments.protocol.run_protocol import PAGE, TABLE, TRIALS
 from plushsense.experiments.protocol.score import NAMELESS
 from plushsense.studio.app.shell import Page, button, html, moment, on_change, section, tag
 from plushsense.studio.app.words import Texts, Words

@@ -15,11 +15,11 @@ import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.experiments.sweep import figures as sweep_figures
-from plushsense.experiments.sweep import report as sweep_report
+from plushsense.experiments.sweep import sweep_page as sweep_report
 from plushsense.experiments.sweep import tables as sweep_tables
 from plushsense.experiments.sweep.grid import CHOSEN, SECOND
-from plushsense.experiments.sweep.report import confusion_words, sections_of, write_sweep_report
 from plushsense.experiments.sweep.results import read_sweep
+from plushsense.experiments.sweep.sweep_page import confusion_words, sections_of, write_sweep_report
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS
 from plushsense.scoring.metrics import accuracy_complexity_ratio
 from support.made_sweep import make_sweep

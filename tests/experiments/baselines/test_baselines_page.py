@@ -6,7 +6,15 @@ from typing import Any
 
 import pytest
 
-from plushsense.experiments.baselines.report import COUNTS, LEAKY, figure, milliseconds, page, program_table, size
+from plushsense.experiments.baselines.baselines_page import (
+    COUNTS,
+    LEAKY,
+    figure,
+    milliseconds,
+    page,
+    program_table,
+    size,
+)
 from plushsense.experiments.baselines.score import BaselinesResult, ProgramGap, ProgramScores, SplitFolds
 
 pytestmark = pytest.mark.apart("models")

@@ -305,7 +305,7 @@ def _place(out: Path) -> Path:
 
 def _write(result: ProtocolResult, out: Path) -> ProtocolResult:
     """Write the files of a result, and return it with their paths."""
-    from plushsense.experiments.protocol.report import figure_table, page
+    from plushsense.experiments.protocol.protocol_page import figure_table, page
     from plushsense.reports.page import write_page
     from plushsense.reports.table import Table
 

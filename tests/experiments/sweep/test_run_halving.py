@@ -12,7 +12,7 @@ import pytest
 from plushsense.core.errors import ConfigError, DivergedError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.sweep.run import SweepProgress
+from plushsense.experiments.sweep.run_sweep import SweepProgress
 from support.sweeping import keys, sweep
 
 pytestmark = pytest.mark.apart("cluster")
@@ -69,7 +69,7 @@ def test_its_scores_are_those_of_trainings_without_a_stop(dataset: Dataset, reco
     assert seen[-1].share == pytest.approx(cost["macs"] / cost["bound_macs"])
     assert (seen[-1].rung, seen[-1].done) == (3, seen[-1].total) and seen[-1].best is not None
     # A page is made of it as of any sweep.
-    from plushsense.experiments.sweep.report import write_sweep_report
+    from plushsense.experiments.sweep.sweep_page import write_sweep_report
 
     assert write_sweep_report(found.out).done == len(mine)
 

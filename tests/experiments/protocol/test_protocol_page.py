@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from plushsense.core.gestures import load_gestures
-from plushsense.experiments.protocol import report
-from plushsense.experiments.protocol.report import PAPER
+from plushsense.experiments.protocol import protocol_page
+from plushsense.experiments.protocol.protocol_page import PAPER
 from plushsense.experiments.protocol.score import (
     SYSTEMS,
     FamilyConfusion,
@@ -63,18 +63,18 @@ def result(simulated=True, label="Tail hit 1", rows=ROWS, **more):
 
 
 def test_shares_bear_their_counts_and_do_not_round_a_miss_away():
-    assert report.percent(44, 45) == "97.8 % (44/45)"
-    assert report.percent(254, 255) == "99.6 % (254/255)"
-    assert report.percent(1, 210) == "0.5 % (1/210)"
-    assert report.percent(45, 45) == "100 % (45/45)"
-    assert report.percent(0, 45) == "0 % (0/45)"
-    assert report.percent(13, 90) == "14 % (13/90)"
-    assert report.percent(0, 0) == "—"
-    assert report.seconds(-0.001) == "0.00"
+    assert protocol_page.percent(44, 45) == "97.8 % (44/45)"
+    assert protocol_page.percent(254, 255) == "99.6 % (254/255)"
+    assert protocol_page.percent(1, 210) == "0.5 % (1/210)"
+    assert protocol_page.percent(45, 45) == "100 % (45/45)"
+    assert protocol_page.percent(0, 45) == "0 % (0/45)"
+    assert protocol_page.percent(13, 90) == "14 % (13/90)"
+    assert protocol_page.percent(0, 0) == "—"
+    assert protocol_page.seconds(-0.001) == "0.00"
 
 
 def test_the_table_stands_beside_the_paper():
-    rows = report.group_table(result()).rows
+    rows = protocol_page.group_table(result()).rows
     by = {(r["title"] or "Fine", r["system"]): r for r in rows}
     assert by["Fine", "Rules"]["paper_answered"] == "≈ 6 %" and by["Fine", "Rules"]["paper_time"] == "—"
     assert by["Fine", "Network"]["paper_time"] == "2.3–2.4 s"
@@ -84,14 +84,14 @@ def test_the_table_stands_beside_the_paper():
     assert by["Fine", "Rules"]["quick"] == ""
     assert by["Fine", "Rules"]["named"] == "—", "rules name no gesture"
     assert (by["Taps", "Network"]["median"], by["Taps", "Network"]["likelihood"]) == ("—", "—")
-    assert len(report.group_table(result()).columns) == 13
-    assert "paper: time" in report.group_table(result()).text()
+    assert len(protocol_page.group_table(result()).columns) == 13
+    assert "paper: time" in protocol_page.group_table(result()).text()
     elsewhere = result(rows=tuple(replace(one, group="other") for one in ROWS))
-    assert len(report.group_table(elsewhere).columns) == 10, "the paper has no such gestures"
+    assert len(protocol_page.group_table(elsewhere).columns) == 10, "the paper has no such gestures"
 
 
 def test_the_csv_holds_numbers_of_groups_and_gestures():
-    rows = report.figure_table(result()).rows
+    rows = protocol_page.figure_table(result()).rows
     assert [(r["of"], r["name"], r["system"]) for r in rows[:1] + rows[-1:]] == [
         ("group", "Energetic", "hybrid"), ("gesture", "Tail hit 1", "hybrid"),
     ]  # fmt: skip
@@ -111,7 +111,7 @@ def test_the_papers_cells_are_of_systems_and_groups_that_there_are():
 def test_a_page_is_whole_and_says_what_it_is():
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
-    page = report.page(result(label="<b>& $x$"))
+    page = protocol_page.page(result(label="<b>& $x$"))
     assert "This is a simulation." in page
     tables = len(re.findall("<h2", page))
     assert page.count("Simulation:</strong>") == tables
@@ -119,7 +119,7 @@ def test_a_page_is_whole_and_says_what_it_is():
     assert "<b>" not in page
     assert "never shown" not in page
     assert not re.search(r'(src|href)="(?!data:)', page)
-    real = report.page(result(simulated=False, left=(LeftOut("P09", "has no session stream"),)))
+    real = protocol_page.page(result(simulated=False, left=(LeftOut("P09", "has no session stream"),)))
     assert "simulation" not in real.lower().replace("<!--", "")
     assert "P09 has no session stream" in real
 
@@ -128,14 +128,14 @@ def test_where_the_paper_has_nothing_its_columns_are_not_there():
     pytest.importorskip("jinja2")
     pytest.importorskip("matplotlib")
     other = result(rows=(row("fast", "cnn"), row("other", "cnn")), simulated=False)
-    page = report.page(other)
+    page = protocol_page.page(other)
     assert "beside the paper" not in page
     assert "five new people" not in page
 
 
 def test_the_figure_draws_every_answer_and_names_who_was_missed():
     pytest.importorskip("matplotlib")
-    made = report.figure(result())
+    made = protocol_page.figure(result())
     axes = made.axes[0]
     assert axes.get_title(loc="left") == "SIMULATION"
     texts = [t.get_text() for t in axes.texts]

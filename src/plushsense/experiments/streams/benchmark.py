@@ -521,7 +521,7 @@ class BenchmarkSpec:
 
 def save_benchmark(result: BenchmarkResult, out: Path) -> None:
     """Write JSON, CSV with a row for each point of a curve, a page and its figures to a folder."""
-    from plushsense.experiments.streams.report import curves, latencies, page, point_table
+    from plushsense.experiments.streams.benchmark_page import curves, latencies, page, point_table
     from plushsense.reports.figures import png
 
     out.mkdir(parents=True, exist_ok=True)

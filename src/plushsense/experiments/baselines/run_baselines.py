@@ -291,7 +291,7 @@ def comparison_id(run: Run, spec: ComparisonSpec) -> str:
 
 def save_baselines(result: BaselinesResult, out: Path) -> None:
     """Write the comparison to a folder: JSON, CSV with a row for each program and split, a page and the figure."""
-    from plushsense.experiments.baselines.report import figure, page, score_table
+    from plushsense.experiments.baselines.baselines_page import figure, page, score_table
     from plushsense.reports.figures import png
 
     out.mkdir(parents=True, exist_ok=True)
