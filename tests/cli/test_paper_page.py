@@ -19,6 +19,7 @@ from plushsense.cli.main import main
 from plushsense.dataset.index import open_dataset
 from plushsense.deploy.proof.verify import Setting
 from plushsense.experiments.protocol.sittings import virtual_sittings
+from plushsense.recording.simulate import SimulationSpec
 from plushsense.studio.app import serve
 from support.archive import make_archive
 
@@ -124,7 +125,8 @@ def run_all() -> None:
     served: list[object] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "cpu_count", lambda: 1)
-        patch.setattr("plushsense.recording.simulate.GESTURES", GESTURES)
+        fewer_gestures = functools.partial(SimulationSpec, gestures=GESTURES)
+        patch.setattr("plushsense.recording.simulate.SimulationSpec", fewer_gestures)
         fewer = functools.partial(virtual_sittings, gestures=GESTURES)
         patch.setattr("plushsense.experiments.protocol.run_protocol.virtual_sittings", fewer)
         patch.setattr("plushsense.deploy.proof.verify.settings_of", lambda name: [Setting(name, "gcc", "-O2")])

@@ -27,7 +27,7 @@ def text_of(value: T) -> T:
 KNOWN = {
     "parser.description", "sentence.get('reason')", "code", "self.adapted_to", "b.adapted_to", "target.address",
     "limit", "merges", "done.bundle.adapted_to", "subject", "total", "c.call_bound", "arch", "bundle.adapted_to",
-    "spec.key", "self.scores.mean('accuracy')", "best.mean('accuracy')",
+    "spec.key", "done.zip", "self.total", "self.scores.mean('accuracy')", "best.mean('accuracy')",
 }  # fmt: skip
 
 

@@ -546,7 +546,7 @@ class Dataset:
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><td>{html.escape(g.label)}</td><td>{g.affect}</td><td>{g.recordings}</td>"
-            f"<td>{g.subjects}</td><td>{g.median_s}</td></tr>"
+            f"<td>{g.subjects}</td><td>{'' if g.median_s is None else g.median_s}</td></tr>"
             for g in self.gesture_counts()
         )
         head = "".join(f"<th>{h}</th>" for h in ("gesture", "affect", "recordings", "people", "median s"))
