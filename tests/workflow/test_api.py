@@ -59,8 +59,11 @@ def test_train_learns_from_everybody_once_scores_and_decisions_are_found(
     assert set(answers.subject.tolist()) == set(origin["validation_subjects"])
     assert np.array_equal(answers.predicted, validation_predictions(held_back.bundle, dataset).predicted)
     shutil.rmtree(dataset.path / "cache")
-    with pytest.raises(DatasetError, match="no validation people"):
+    with pytest.raises(DatasetError, match=r"no longer stored .* kept for 30 days"):
         validation_predictions(trained.bundle, dataset)
+    others = replace(trained.bundle, provenance={**origin, "split": ""})
+    with pytest.raises(DatasetError, match="no validation people"):
+        validation_predictions(others, dataset)
 
 
 def test_a_network_of_merged_gestures_knows_its_data_set(dataset: Dataset, tmp_path: Path) -> None:

@@ -111,9 +111,15 @@ def try_adapting(
         pairs = np.array([[getattr(metrics, name)(one) for one in pair] for pair in counts])
         first = float(pairs[0, 1] - pairs[0, 0])
         scores[name] = {"before": float(pairs[:, 0].mean()), "after": float(pairs[:, 1].mean()), "first": first}
-    worse = sum(change < -1 for change in right)
     return PersonGain(
-        *(subject, len(counts), refused, float(np.mean(recordings)), float(np.mean(right)), min(right), worse, scores)
+        subject=subject,
+        choices=len(counts),
+        refused=refused,
+        recordings=float(np.mean(recordings)),
+        right_change=float(np.mean(right)),
+        right_change_worst=min(right),
+        choices_worse=sum(change < -1 for change in right),
+        scores=scores,
     )
 
 

@@ -452,13 +452,17 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
             since the training.
     """
     dataset = as_dataset(dataset)
-    stored = journal_of(dataset, _PREDICTIONS).find(_predictions_id(bundle))
-    if bundle.provenance.get("split") != WHOLE_PEOPLE or stored is None:
+    if bundle.provenance.get("split") != WHOLE_PEOPLE:
         raise DatasetError("This network has no validation people: evaluate it instead.")
     if not is_training_content(bundle, dataset):
         raise DatasetError(
             "The data set '{name}' was changed since this network was trained: evaluate it instead.",
             name=dataset.head.name,
+        )
+    if (stored := journal_of(dataset, _PREDICTIONS).find(_predictions_id(bundle))) is None:
+        raise DatasetError(
+            "The answers of this network on its validation people are no longer stored (they are kept for 30 days in "
+            "the data set's cache): evaluate it instead."
         )
     known = ~np.isin(stored["subject"], [NOBODY, UNKNOWN_SUBJECT])
     arrays = {key: value[known] for key, value in stored.items() if key != "labels"}

@@ -497,7 +497,7 @@ def _threshold_curve(
 
 @dataclass(frozen=True)
 class BenchmarkSpec:
-    """What the continuous benchmark compares.
+    """Settings of `stream_benchmark`: the split, and the systems that are compared on the streams of people left out.
 
     Attributes:
         split: "by-subject:5" or "leave-one-subject-out".

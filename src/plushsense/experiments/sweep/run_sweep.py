@@ -52,7 +52,7 @@ class SweepProgress(JobProgress):
 
 @dataclass(frozen=True)
 class SweepSpec:
-    """What to sweep, and where.
+    """Settings of `sweep`: the grid of networks and schedules, the folder of the results, and what trains them.
 
     Attributes:
         grid: "paper", "scripts", "people", the path of a TOML file, or a `GridSpec`.
@@ -302,7 +302,7 @@ def _name(task: Task) -> str:
 
 @dataclass(frozen=True)
 class SweepPreview:
-    """What a sweep would train.
+    """The trainings that a sweep would run, with their cost, or the problems of its grid; see `preview`.
 
     Attributes:
         grid: its settings; ``planned`` is None if it has ``problems``.

@@ -223,7 +223,7 @@ class ReportResult:
 
     @property
     def summary(self) -> list[str]:
-        """What was written, in words."""
+        """Return lines that say how many tables and figures were written, and into which folder."""
         return [f"{self.n_files} tables and figures in {self.files}"]
 
     def to_json(self) -> dict[str, object]:
