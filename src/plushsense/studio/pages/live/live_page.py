@@ -15,7 +15,7 @@ from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
 from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
-from plushsense.studio.app.toys import Toys, described, toy_title
+from plushsense.studio.app.toys import ToyInUseError, Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL
 from plushsense.studio.pages.live import adapting, validation_page
@@ -166,10 +166,12 @@ class _Controls:
         self._page.say("")
         self._bundle.error = self._toy.error = None
         done = False
-        with self._page.show_errors():
+        with self._page.show_errors(lambda: self._run(command, *args)):
             try:
                 await asyncio.to_thread(command, *args)
                 done = True
+            except ToyInUseError:
+                raise
             except PlushSenseError as refusal:
                 of_network = isinstance(refusal, BundleError) or refusal.message.values.get("field") == "network"
                 field = self._bundle if of_network else self._toy

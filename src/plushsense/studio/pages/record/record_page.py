@@ -14,7 +14,7 @@ from plushsense.core.errors import AddressError, ConfigError, DeviceError, Layou
 from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary
 from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
-from plushsense.studio.app.toys import toy_title
+from plushsense.studio.app.toys import ToyInUseError, toy_title
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import CHILD, show_child
 from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
@@ -204,6 +204,8 @@ class _SessionLists:
 
 
 def _is_of_toy(error: PlushSenseError) -> bool:
+    if isinstance(error, ToyInUseError):
+        return False
     return isinstance(error, DeviceError | LayoutError | AddressError) or error.message.values.get("field") == "toy"
 
 
@@ -218,7 +220,7 @@ async def _open_session(
     begin.disable()
     page.say(page.words("Opening the toy …"))
     try:
-        with page.show_errors():
+        with page.show_errors(partial(_open_session, page, begin, work, refused)):
             try:
                 session = await run.io_bound(work)
             except PlushSenseError as error:
