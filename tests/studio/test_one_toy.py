@@ -95,6 +95,7 @@ def test_who_is_not_busy_makes_way(tmp_path: Path) -> None:
 
             opened = ToyUse(f"{url}?layout=plush-15", page, stop, name, lambda: busy)
             device = toys.open(opened, lambda: open_device(url))
+            toys.update_uses()
             return device, stopped
 
         finished, ended = use("record", False, "S01/1")

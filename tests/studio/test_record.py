@@ -131,7 +131,7 @@ def test_every_page_names_the_session_that_is_being_recorded(studio: Fixture, lo
     assert axe(home) == []
     marked(home, "in-use").get_by_role("link").click()
     home.wait_for_url("**/record?session=S01/1")
-    assert marked(home, "in-use").count() == 0
+    assert not marked(home, "in-use").is_visible()
     home.goto(server.url + "/review")
     marked(home, "in-use").get_by_text("Recording now: S01/1.").wait_for()
     # The session is ended early: its recordings are one button away.

@@ -22,6 +22,7 @@ from nicegui.events import GenericEventArguments
 from nicegui.translations import translations
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.toys import ToyInUseError, Toys, ToyUse
 from plushsense.studio.app.words import LANGUAGES, PageTexts, Texts, Words
 from plushsense.studio.app.workspace import ChangeSignal, Workspace, refusal_of
@@ -274,7 +275,9 @@ def _in_use_bar(page: Page) -> None:
                     link = ui.link(show, address(use.page, session=use.name)).classes("ps-link")
                     named(link, f"{show}: {use.name or use.toy}")
                     if not use.name:
-                        button("stop-use", words("Stop"), on_page(partial(stop, use)), "outline color=white", about=use.toy)
+                        button(
+                            "stop-use", words("Stop"), on_page(partial(stop, use)), "outline color=white", about=use.toy
+                        )
 
     draw()
     on_change(toys.in_use_changed, draw)
@@ -398,12 +401,12 @@ def query() -> dict[str, str]:
 
 
 def query_path(workspace: Workspace, key: str, allowed: Iterable[str]) -> str:
-    """Return the path in the query parameter ``key`` if it is allowed, else the first allowed path, or ""."""
+    """Return the path in the query parameter ``key`` if it is allowed, else the last choice, or the first, or ""."""
     paths = list(allowed)
     with suppress(PlushSenseError):
         if (path := str(workspace.inside(query().get(key, "")))) in paths:
             return path
-    return next(iter(paths), "")
+    return workspace.part(Choices).last(key, paths)
 
 
 def set_address(path: str) -> None:

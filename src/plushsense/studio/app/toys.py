@@ -29,6 +29,7 @@ from plushsense.devices.opening import (
     speed_of,
     with_speed,
 )
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.windows.clock import SampleClock
@@ -324,7 +325,11 @@ class Toys:
         self.searching = False
         self.searched = False
         self._workspace = workspace
+        self._choices = workspace.part(Choices)
         self._lock = threading.Lock()
+        if not workspace.toy and (last := self._choices.last("toy")):
+            with contextlib.suppress(PlushSenseError):
+                self.choose(last)
 
     def search(self, scan_s: float = SCAN_S, *, network: bool = True) -> None:
         """Start a search in the background, unless one is running; see `list_devices`."""
@@ -358,11 +363,12 @@ class Toys:
                 self._workspace.inside(layout)
         if url != self._workspace.toy:
             self._workspace.toy, self.trial = url, None
+        self._choices.keep(toy=url)
         self.changed.notify()
         return url
 
     def open(self, use: ToyUse, opening: Callable[[], Device]) -> TappedDevice:
-        """Open a toy by ``opening``; the use lasts until the device is closed.
+        """Open a toy by ``opening``; the use lasts until the device is closed. Call `update_uses` when it has begun.
 
         Raises:
             ToyInUseError: if another page uses this toy. Otherwise as ``opening``.
@@ -387,7 +393,6 @@ class Toys:
             other.stop()
         if other is not None:
             raise ToyInUseError(other)
-        self.update_uses()
 
     def _release(self, use: ToyUse) -> None:
         with self._lock:

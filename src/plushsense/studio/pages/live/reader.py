@@ -99,7 +99,8 @@ class LiveReader:
             url = with_speed(choice.toy, self._workspace.speed)
             self.stop()
             use = ToyUse(choice.toy, "live", self._stop_for_others)
-            device = self._workspace.part(Toys).open(use, lambda: open_device(url, bundle.layout, reconnect=True))
+            toys = self._workspace.part(Toys)
+            device = toys.open(use, lambda: open_device(url, bundle.layout, reconnect=True))
             try:
                 bundle_run = _BundleRun(bundle, run_on(device, classifier, warn=_kept), reactor)
             except BaseException:
@@ -120,6 +121,7 @@ class LiveReader:
                 target=self._read, args=(device, self._ends), name="plushsense-live", daemon=True
             )
             self._thread.start()
+        toys.update_uses()
         self.changed.notify()
 
     def choose(self, bundle: Path | None, engine: str, reactions: str) -> None:

@@ -13,6 +13,7 @@ from nicegui import ui
 
 from plushsense.experiments.protocol.run_protocol import PAGE, TABLE, TRIALS
 from plushsense.experiments.protocol.score import NAMELESS
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.shell import Page, button, html, moment, on_change, section, tag
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.live.adapting import PersonFields
@@ -84,7 +85,7 @@ class _ValidationPanel:
             tag(self._repetitions, "validation-times")
             datasets = {str(p): page.workspace.title(p) for p in page.workspace.datasets()}
             rules = {"": words("nothing: without the rules")} | datasets
-            first = next(iter(datasets), "")
+            first = page.workspace.part(Choices).last("dataset", datasets)
             self._rules = ui.select(rules, value=first, label=words("Tune the old rules on")).classes("w-64")
             tag(self._rules, "validation-rules")
             noted = ui.checkbox(words("The toy has rules of its own: note its reactions"))

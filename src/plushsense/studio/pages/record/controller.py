@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from plushsense.core.errors import ConfigError, DatasetError, LayoutError
+from plushsense.core.errors import ConfigError, DatasetError, LayoutError, PlushSenseError
 from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.sentences import Message
 from plushsense.core.toml import builtin_names
@@ -348,6 +349,8 @@ class RecordController:
         except BaseException:
             device.close()
             raise
+        with contextlib.suppress(PlushSenseError):  # a file that only this session may read
+            self._toys.choose(url)
         return device
 
     def _is_busy(self, name: str) -> bool:
