@@ -13,7 +13,7 @@ from plushsense.studio.app.choices import FILE, Choices
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import Workspace
 from support.browsing import connected, marked
-from support.recording_pages import CALM, begun, choose
+from support.recording_pages import CALM, choose
 
 Fixture = Callable[..., Any]
 
