@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,13 @@ def test_a_toy_in_use_is_named_and_freed_by_one_click(studio: Fixture, look: Fix
         marked(live, "stop").wait_for()
         marked(page, "in-use").get_by_text(f"Live now: {toy}.").wait_for()
         assert not marked(live, "in-use").is_visible()
+        # The network was trained on virtual people, which the mark and the log say although the toy is real.
+        marked(live, "simulation").get_by_text("this network was trained on virtual people").wait_for()
+        marked(live, "events").locator("li[data-id]").first.wait_for()
+        with live.expect_download() as saved:
+            marked(live, "log-save").click()
+        rows = list(csv.DictReader(Path(saved.value.path()).read_text("utf-8").splitlines()))
+        assert {row["simulated"] for row in rows} == {"yes"}
         # A test of the toy says why it cannot be made, and can be made after one click.
         page.goto(server.url)
         connected(page)

@@ -262,6 +262,4 @@ def _bundle(path: Path) -> BundleEntry:
     except (PlushSenseError, OSError) as cause:
         return BundleEntry(path, path.stem, refused=_refusal(path, cause))
     origin = bundle.provenance
-    return BundleEntry(
-        path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bool(origin.get("simulated"))
-    )
+    return BundleEntry(path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bundle.simulated)

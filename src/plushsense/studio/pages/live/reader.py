@@ -25,7 +25,14 @@ from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.toys import TappedDevice, Toys, ToyUse
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-from plushsense.studio.pages.live.live_state import Connection, EventSpan, LiveChoice, LiveState, quiet_reason
+from plushsense.studio.pages.live.live_state import (
+    Connection,
+    EventSpan,
+    LiveChoice,
+    LiveState,
+    SimulationKind,
+    quiet_reason,
+)
 
 KEPT_SPANS = 200
 KEPT_SPAN_S = 600.0
@@ -164,6 +171,13 @@ class LiveReader:
         if self._occupied():
             raise ConfigError("A validation is under way. End it first.")
         self.stop()
+
+    @property
+    def simulated(self) -> SimulationKind:
+        """What is virtual of the toy that is being read, or was last, and the network."""
+        if self.device is None or self.bundle is None:
+            return ""
+        return "toy" if self.choice.simulated else "network" if self.bundle.simulated else ""
 
     @property
     def person(self) -> VirtualDevice | None:
@@ -364,7 +378,7 @@ class LiveReader:
                 event.source,
                 at=time.time(),
                 network=self.choice.bundle.stem if self.choice.bundle is not None else "",
-                simulated=self.choice.simulated,
+                simulated=self.simulated,
                 session=self._started,
                 subject=self.subject,
             )
