@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 from nicegui import run, ui
 
@@ -120,9 +121,9 @@ class ToySection:
                 return "warning" if isinstance(error, ToyInUseError) else "error", words.error(error)
             return "error", words.failure(" ".join(str(error).split()) or type(error).__name__)
         assert result is not None
-        values = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
+        values: dict[str, Any] = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
         key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
-        values |= {"frames": str(result.frames), "layout": result.layout, "malformed": str(result.malformed)}
+        values |= {"frames": result.frames, "layout": result.layout, "malformed": result.malformed}
         return ("good" if key == "good" else "warning"), words(_TESTS[key], **values)
 
     def _show_others(self) -> None:
