@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import gettext
+import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
-
-from babel import Locale
-from babel.messages.catalog import Catalog
-from babel.messages.pofile import read_po
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Filler, Message, single_stops
@@ -28,6 +26,9 @@ Texts = Mapping[str, str]
 """Annotation of a table of English texts that `Words` translates; a test looks for texts in such tables, too."""
 
 _LOCALE = Path(__file__).parents[1] / "locale"
+_NUMBERS = {"en": (".", ","), "lv": (",", "\N{NO-BREAK SPACE}")}
+"""The decimal point and the thousands separator of each language."""
+_PO_LINE = re.compile(r'(?:(msgctxt|msgid|msgid_plural|msgstr(?:\[\d\])?) )?(".*")')
 # The separator that gettext uses between context and text.
 _CONTEXT = "\x04"
 UNITS: Texts = {"count": "counts"}
@@ -73,11 +74,10 @@ class Words:
     def __init__(self, language: str) -> None:
         self.language = language if language in LANGUAGES else next(iter(LANGUAGES))
         self._catalog, self._plural_form = _catalog(self.language)
-        symbols = Locale(self.language).number_symbols["latn"]
-        self.decimal_point, self._group = symbols["decimal"], symbols["group"]
+        self.decimal_point, self._group = _NUMBERS[self.language]
 
     def __call__(self, text: str, /, **values: Any) -> str:
-        translated = str(self._translation(text) or text.rpartition(_CONTEXT)[2])
+        translated = str(self._catalog.get(text) or text.rpartition(_CONTEXT)[2])
         return translated.format(**values) if values else translated
 
     def each(self, *texts: str) -> list[str]:
@@ -86,14 +86,9 @@ class Words:
 
     def plural(self, one: str, many: str, n: int) -> str:
         """Return the text for a number, which replaces ``{n}``, in the form that the language has for it."""
-        forms = self._translation(one)
+        forms = self._catalog.get(one)
         form = forms[self._plural_form(n)] if isinstance(forms, tuple) else many if n != 1 else one
         return form.rpartition(_CONTEXT)[2].format(n=n)
-
-    def _translation(self, text: str) -> str | tuple[str, ...]:
-        context, _, text = text.rpartition(_CONTEXT)
-        message = self._catalog.get(text, context or None)
-        return message.string if message is not None else ""  # type: ignore[return-value]
 
     def number(self, value: float, digits: int = 0) -> str:
         """Format a number with the decimal separator of this language."""
@@ -109,7 +104,8 @@ class Words:
 
     def names(self, kind: str) -> dict[str, str]:
         """Return the translated names of a kind of thing, "gesture" or "channel", by their English names."""
-        return {str(m.id): str(m.string) for m in self._catalog if m.context == kind}
+        start = in_context(kind, "")
+        return {text.removeprefix(start): str(s) for text, s in self._catalog.items() if text.startswith(start)}
 
     def gesture(self, label: str) -> str:
         """Return the name of a gesture in this language, or ``label`` itself if it has none."""
@@ -147,7 +143,7 @@ class Words:
         else:
             stored = message
         template = stored.get("template", "")
-        translation = self._translation(template) if template else ""
+        translation = self._catalog.get(template) if template else ""
         if not translation and self.language == next(iter(LANGUAGES)) and _has_message(stored.get("values", {})):
             translation = template
         if translation:
@@ -203,11 +199,21 @@ class _ValueFiller(Filler):
 
 
 @cache
-def _catalog(language: str) -> tuple[Catalog, Callable[[int], int]]:
-    """Return the translations, and the function that maps a number to the index of its plural form."""
-    path = _LOCALE / f"{language}.po"
-    if not path.is_file():
-        return Catalog(), lambda n: int(n != 1)
-    with path.open("rb") as file:
-        catalog = read_po(file)
-    return catalog, gettext.c2py(catalog.plural_expr)
+def _catalog(language: str) -> tuple[dict[str, str | tuple[str, ...]], Callable[[int], int]]:
+    """Return the translations, and the function that maps a number to the index of its plural form.
+
+    A context stands before its text, as in `in_context`; a text with plural forms has a tuple of translations.
+    """
+    translations: dict[str, str | tuple[str, ...]] = {}
+    for entry in (_LOCALE / f"{language}.po").read_text(encoding="utf-8").split("\n\n"):
+        fields: dict[str, str] = {}
+        field = ""
+        for name, quoted in (match.groups() for match in map(_PO_LINE.fullmatch, entry.splitlines()) if match):
+            field = name or field
+            fields[field] = fields.get(field, "") + json.loads(quoted)
+        if fields:
+            text = fields["msgid"] if "msgctxt" not in fields else in_context(fields["msgctxt"], fields["msgid"])
+            forms = tuple(fields[name] for name in sorted(fields) if name.startswith("msgstr["))
+            translations[text] = forms or fields["msgstr"]
+    header = str(translations.pop(""))
+    return translations, gettext.c2py(header.partition("plural=")[2].partition(";")[0])
