@@ -1,4 +1,8 @@
-"""Translate the texts of the pages, which the source has in English; see ``locale/<language>.po`` of the studio."""
+"""Translate the texts of the pages, which the source has in English; see ``locale/<language>.po`` of the studio.
+
+A translation names the forms that a word has after a number: ``{n:rinda|rindas}`` becomes *21 rinda*, *12 rindas*, and
+``{n:atlikta # rinda|atliktas # rindas}`` has the number within. The English texts count as `Filler` does: ``{n:row}``.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +32,7 @@ Texts = Mapping[str, str]
 _LOCALE = Path(__file__).parents[1] / "locale"
 _NUMBERS = {"en": (".", ","), "lv": (",", "\N{NO-BREAK SPACE}")}
 """The decimal point and the thousands separator of each language."""
-_PO_LINE = re.compile(r'(?:(msgctxt|msgid|msgid_plural|msgstr(?:\[\d\])?) )?(".*")')
+_PO_LINE = re.compile(r'(?:(msgctxt|msgid|msgstr) )?(".*")')
 # The separator that gettext uses between context and text.
 _CONTEXT = "\x04"
 UNITS: Texts = {"count": "counts"}
@@ -77,18 +81,16 @@ class Words:
         self.decimal_point, self._group = _NUMBERS[self.language]
 
     def __call__(self, text: str, /, **values: Any) -> str:
-        translated = str(self._catalog.get(text) or text.rpartition(_CONTEXT)[2])
-        return translated.format(**values) if values else translated
+        translated = self._catalog.get(text) or text.rpartition(_CONTEXT)[2]
+        return _FormFiller(self).vformat(translated, (), values) if values else translated
 
     def each(self, *texts: str) -> list[str]:
         """Return the translations of several texts, such as the headings of a table."""
         return [self(text) for text in texts]
 
-    def plural(self, one: str, many: str, n: int) -> str:
-        """Return the text for a number, which replaces ``{n}``, in the form that the language has for it."""
-        forms = self._catalog.get(one)
-        form = forms[self._plural_form(n)] if isinstance(forms, tuple) else many if n != 1 else one
-        return form.rpartition(_CONTEXT)[2].format(n=n)
+    def form(self, n: float, forms: Sequence[str]) -> str:
+        """Return the form that goes with a number: that of 1 (in Latvian also of 21), or that of several."""
+        return forms[self._plural_form(int(n))] if n == int(n) else forms[-1]
 
     def number(self, value: float, digits: int = 0) -> str:
         """Format a number with the decimal separator of this language."""
@@ -105,7 +107,7 @@ class Words:
     def names(self, kind: str) -> dict[str, str]:
         """Return the translated names of a kind of thing, "gesture" or "channel", by their English names."""
         start = in_context(kind, "")
-        return {text.removeprefix(start): str(s) for text, s in self._catalog.items() if text.startswith(start)}
+        return {text.removeprefix(start): s for text, s in self._catalog.items() if text.startswith(start)}
 
     def gesture(self, label: str) -> str:
         """Return the name of a gesture in this language, or ``label`` itself if it has none."""
@@ -149,7 +151,7 @@ class Words:
         if translation:
             # A stored job of another version may lack a value.
             with suppress(KeyError):
-                return single_stops(_ValueFiller(self).vformat(str(translation), (), stored["values"]))
+                return single_stops(_ValueFiller(self).vformat(translation, (), stored["values"]))
         text = str(stored.get("message", ""))
         return self(quoted, message=text) if text and self.language != next(iter(LANGUAGES)) else text
 
@@ -169,11 +171,21 @@ def _has_message(value: object) -> bool:
     return isinstance(value, Message) or (isinstance(value, list | tuple) and any(map(_has_message, value)))
 
 
-class _ValueFiller(Filler):
-    """Fill values of a `Message` into its translation, in the form that the language has for them."""
+class _FormFiller(Filler):
+    """Fill values into a translation, with the form of a word that its language has for a number."""
 
     def __init__(self, words: Words) -> None:
         self._words = words
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if "|" in format_spec:
+            form, number = self._words.form(value, format_spec.split("|")), self._words.count(value)
+            return form.replace("#", number) if "#" in form else f"{number} {form}"
+        return self._words.count(value) if format_spec == "," else super().format_field(value, format_spec)
+
+
+class _ValueFiller(_FormFiller):
+    """Fill values of a `Message` into its translation, as the language has them."""
 
     def get_value(self, key: int | str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         return self._worded(str(key), kwargs[str(key)])
@@ -193,18 +205,15 @@ class _ValueFiller(Filler):
         return words.gesture(str(value)) if key in ("gesture", "gestures") else value
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        if isinstance(value, float):
+        if isinstance(value, float) and "|" not in format_spec:
             return format(value, format_spec or ".10g").replace(".", self._words.decimal_point)
         return super().format_field(value, format_spec)
 
 
 @cache
-def _catalog(language: str) -> tuple[dict[str, str | tuple[str, ...]], Callable[[int], int]]:
-    """Return the translations, and the function that maps a number to the index of its plural form.
-
-    A context stands before its text, as in `in_context`; a text with plural forms has a tuple of translations.
-    """
-    translations: dict[str, str | tuple[str, ...]] = {}
+def _catalog(language: str) -> tuple[dict[str, str], Callable[[int], int]]:
+    """Return the translations, by English text as `in_context` has it, and the function that chooses a plural form."""
+    translations: dict[str, str] = {}
     for entry in (_LOCALE / f"{language}.po").read_text(encoding="utf-8").split("\n\n"):
         fields: dict[str, str] = {}
         field = ""
@@ -213,7 +222,5 @@ def _catalog(language: str) -> tuple[dict[str, str | tuple[str, ...]], Callable[
             fields[field] = fields.get(field, "") + json.loads(quoted)
         if fields:
             text = fields["msgid"] if "msgctxt" not in fields else in_context(fields["msgctxt"], fields["msgid"])
-            forms = tuple(fields[name] for name in sorted(fields) if name.startswith("msgstr["))
-            translations[text] = forms or fields["msgstr"]
-    header = str(translations.pop(""))
-    return translations, gettext.c2py(header.partition("plural=")[2].partition(";")[0])
+            translations[text] = fields["msgstr"]
+    return translations, gettext.c2py(translations.pop("").partition("plural=")[2].partition(";")[0])
