@@ -15,7 +15,8 @@ from filelock import FileLock
 
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
 from plushsense.core.sentences import Message, plural
-from plushsense.dataset.index import as_dataset, change_head, open_dataset
+from plushsense.dataset.files import change_head
+from plushsense.dataset.index import as_dataset, open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
 from plushsense.dataset.publishing.checking import StageProgress

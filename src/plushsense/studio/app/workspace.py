@@ -16,10 +16,8 @@ from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.sentences import Message
-from plushsense.dataset.files import sha256_of
+from plushsense.dataset.files import change_head, list_package_files, sha256_of
 from plushsense.dataset.importing.archives import DEVICE_NAME
-from plushsense.dataset.index import change_head
-from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.writer import SESSION_HEAD
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from nicegui import run, ui
 
-from plushsense.dataset.privacy.forget import people_of_dataset
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, button, heading, named, on_page, tag
@@ -24,7 +23,6 @@ from plushsense.studio.pages.home.sections import (
     titled_card,
 )
 from plushsense.studio.widgets.elements import on_enter, open_dialog, size, summary
-from plushsense.workflow.datasets import Forgotten, forget
 
 _MAX_PATHS = 5
 
@@ -135,6 +133,8 @@ class ForgetDialog:
 
     async def open(self) -> None:
         """Open the dialog with the choice of the person."""
+        from plushsense.dataset.privacy.forget import people_of_dataset
+
         words = self._words
         with self._page.show_errors():
             self._jobs.check_unused(self._entry.path)
@@ -152,6 +152,8 @@ class ForgetDialog:
 
     async def _preview(self, person: str) -> None:
         """Show what would be removed and what would be left."""
+        from plushsense.workflow.datasets import Forgotten, forget
+
         words, workspace = self._words, self._page.workspace
         self._person = person
         found: Forgotten | None = None

@@ -16,10 +16,8 @@ from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import parse_name
 from plushsense.core.sentences import Message
-from plushsense.dataset.importing.build import RECORDER
-from plushsense.dataset.marks import MARKS
+from plushsense.dataset.marks import MARKS, RECORDER
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
-from plushsense.models.bundle import Bundle
 from plushsense.recording.session import is_finished
 from plushsense.recording.writer import SessionHead
 from plushsense.studio.app.toys import Toys
@@ -257,6 +255,8 @@ def _session(path: Path, datasets: Iterable[DatasetEntry]) -> SessionEntry:
 
 
 def _bundle(path: Path) -> BundleEntry:
+    from plushsense.models.bundle import Bundle
+
     try:
         bundle = Bundle.load(path)
     except (PlushSenseError, OSError) as cause:
