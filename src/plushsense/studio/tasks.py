@@ -119,7 +119,9 @@ def _import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """
     settings: dict[str, Any] = {"add_to": True} if spec.get("add") else {"name": spec.get("name") or None}
     with _collected(spec) as source:
-        done = import_recordings(source, spec["dest"], progress=reporter.count, **settings)
+        done = import_recordings(
+            source, spec["dest"], progress=reporter.count, readmit=spec.get("readmit", False), **settings
+        )
     stored = done.to_json()
     result = {key: stored[key] for key in ("recordings", "subjects", "added", "rejected")}
     return {**result, "dataset": str(spec["dest"]), "warnings": list(done.notes), "flagged": len(done.warnings)}
@@ -158,9 +160,10 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     rejected: list[dict[str, str]] = []
     refusals: list[PlushSenseError] = []
     restored = len(sources) == 1 and is_backup(sources[0])
+    readmit = bool(spec.get("readmit"))
     flagged = 0
     if restored:
-        restore(sources[0], dest, progress=reporter.count)
+        restore(sources[0], dest, progress=reporter.count, readmit=readmit)
         sources = []
     for source in sources:
         adding = dest.exists()
@@ -174,6 +177,7 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
                 guess_layout=not adding,
                 # What a single source proves may not fit the others.
                 adopt_proposals=len(sources) == 1 and not adding,
+                readmit=readmit,
                 limits=UNPACKED,
                 progress=reporter.count,
                 **settings,
@@ -230,7 +234,8 @@ def _restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Restore the backup ``file`` as the new data set ``dest`` with the name ``name``."""
     # One of the studio's own backups: only the disk limits it.
     limits = UnpackLimits(max(1, shutil.disk_usage(Path(spec["file"]).parent).free), files=1 << 30)
-    dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits)
+    readmit = bool(spec.get("readmit"))
+    dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits, readmit=readmit)
     write_file(dataset.path / HEAD, replace(dataset.head, name=spec["name"]).to_toml())
     return {"dataset": str(spec["dest"]), "recordings": len(dataset.recordings), "people": len(dataset.subjects)}
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 from nicegui import run, ui
 
+from plushsense.dataset.backup import backup_people
 from plushsense.dataset.privacy.forget import people_of_dataset
+from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, button, heading, named, on_page, tag
@@ -23,7 +26,7 @@ from plushsense.studio.pages.home.sections import (
     simulation_badge,
     titled_card,
 )
-from plushsense.studio.widgets.elements import on_enter, open_dialog, size, summary
+from plushsense.studio.widgets.elements import admitting, on_enter, open_dialog, size, summary
 from plushsense.workflow.datasets import Forgotten, forget
 
 _MAX_PATHS = 5
@@ -97,7 +100,7 @@ class DatasetSection:
             self._jobs.start("backup", spec, self._page.words("Backup of “{name}”", name=entry.name))
 
     def _show_backups(self, backups: Sequence[Path]) -> None:
-        words = self._page.words
+        page, words = self._page, self._page.words
         self._backups.clear()
         self._backups.set_visibility(bool(backups))
         with self._backups:
@@ -107,18 +110,19 @@ class DatasetSection:
                     ui.label(f"{path.stem} · {size(path.stat().st_size, words)}").classes("flex-grow ps-break")
                     link = ui.link(words("Download"), download_address(BACKUPS, path.stem)).classes("ps-link")
                     named(link.props("download"), f"{words('Download')}: {path.stem}")
-                    restore = on_page(lambda path=path: self._restore(path))
+                    restore = on_page(lambda path=path: admitting(page, partial(self._restore, path)))
                     button("", words("Restore"), restore, SMALL, about=path.stem)
                     discard = on_page(lambda path=path: self._discard(path))
                     button("", words("Discard"), discard, SMALL, about=path.stem)
 
-    def _restore(self, path: Path) -> None:
+    async def _restore(self, path: Path, readmit: bool) -> None:
         """Start to restore a backup as a new data set; the present one is not changed."""
         workspace = self._page.workspace
-        with self._page.show_errors():
-            name = workspace.free_name(DATASETS, path.stem, separator=" ")
-            spec = {"file": str(path), "dest": str(workspace.new(DATASETS, name)), "name": name}
-            self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))
+        if not readmit:
+            refuse_removed(path, await run.io_bound(backup_people, path) or ())
+        name = workspace.free_name(DATASETS, path.stem, separator=" ")
+        spec = {"file": str(path), "dest": str(workspace.new(DATASETS, name)), "name": name, "readmit": readmit}
+        self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))
 
     async def _discard(self, path: Path) -> None:
         workspace = self._page.workspace
