@@ -287,15 +287,17 @@ def find_mentions(places: Iterable[Path], subject: str, apart_from: Path) -> Ite
             here = Path(at)
             yield from (here / name for name in folders if name == subject)
             folders[:] = [name for name in folders if name != subject and (here / name).resolve() != apart_from]
-            for path in (here / name for name in names):
-                raw = path.suffix.lower() == ".csv" and {RECORDINGS, STREAMS} & set(path.parts)
-                try:
-                    texts = iter([words_of_rows(path.read_bytes())]) if raw else texts_in(path)
-                    found = _named(path.name, subject) or any(_holds(text, subject) for text in texts)
-                except (OSError, ValueError):
-                    found = True
-                if found:
-                    yield path
+            yield from (here / name for name in names if mentions(here / name, subject))
+
+
+def mentions(path: Path, subject: str) -> bool:
+    """Return whether a file contains the code of a person in its name or its text, or cannot be read."""
+    raw = path.suffix.lower() == ".csv" and {RECORDINGS, STREAMS} & set(path.parts)
+    try:
+        texts = iter([words_of_rows(path.read_bytes())]) if raw else texts_in(path)
+        return _named(path.name, subject) or any(_holds(text, subject) for text in texts)
+    except (OSError, ValueError):
+        return True
 
 
 def forget(dataset: str | Path, subject: str) -> RemovalPlan:
