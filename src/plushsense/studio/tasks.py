@@ -30,7 +30,6 @@ from plushsense.dataset.backup import backup, is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings, propose
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.publishing.checking import validate_package
 from plushsense.dataset.store import HEAD
 from plushsense.deploy.profile import profile
@@ -44,6 +43,7 @@ from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
 from plushsense.workflow.export import export
+from plushsense.workflow.forgetting import forget_everywhere
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people, refits
 from plushsense.workflow.reporting import check_folder
@@ -241,14 +241,17 @@ def _restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 def _forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Remove ``person`` from ``dataset``; the result does not name the person.
+    """Remove what is ``chosen`` of the traces of ``person`` in ``home`` and in the data sets ``given``.
 
     Raises:
         ConfigError: if ``person`` is missing, as in a job resumed after a restart, because it is never stored.
     """
     if "person" not in spec:
-        raise ConfigError("The person's code is not stored. Choose the person again in the menu of the data set.")
-    return {"dataset": spec["dataset"], "files": len(forget(spec["dataset"], spec["person"]).files)}
+        raise ConfigError("The person's code is not stored. Choose the person again on the home page.")
+    given = [Path(path) for path in spec["given"]]
+    done = forget_everywhere(Path(spec["home"]), spec["person"], spec["chosen"], given)
+    left = len(done.kept) + len(done.failed) + len(done.found.mentions)
+    return {"removed": len(done.removed), "left": left, "receipt": done.to_json()}
 
 
 def _publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:

@@ -426,7 +426,7 @@ def forget_everywhere(home: Path, person: str, chosen: Collection[str], given: I
         except PlushSenseError as refusal:
             failed.append((trace, refusal.message))
         except OSError as cause:
-            failed.append((trace, Message("The computer refused: {why}.", why=cause.strerror or str(cause))))
+            failed.append((trace, Message("The computer refused: {why}{where}.", why=cause.strerror or str(cause), where="")))
     kept = tuple(t for t in found.traces if t.id not in chosen)
     found = replace(found, mentions=tuple(path for path in found.mentions if path.exists()))
     return RemovalReceipt(found, tuple(removed), kept, tuple(failed))

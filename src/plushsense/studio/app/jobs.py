@@ -27,8 +27,8 @@ INCOMING = "incoming"
 """Folder in the work folder for uploaded files that are not imported yet; it is removed when the studio starts."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _MAX_REPORTS = 2000
-# Keys of a spec that are never stored, because they identify people.
-_SECRET_KEYS = ("person",)
+# Keys of a spec or result that are never stored, because they identify people.
+_SECRET_KEYS = ("person", "chosen", "receipt")
 _STOP_S = 10.0
 
 
@@ -262,6 +262,7 @@ class Jobs:
         stored = asdict(job)
         for key in _SECRET_KEYS:
             stored["spec"].pop(key, None)
+            stored["result"].pop(key, None)
         write_file(self._folder / f"{job.id}.json", json.dumps(stored, default=str))
 
 

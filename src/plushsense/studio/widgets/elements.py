@@ -55,7 +55,7 @@ _TITLES = {
     "check": "Checking “{name}”",
     "backup": "Backup of “{name}”",
     "restore": "Restoring “{name}”",
-    "forget": "Removing a person from “{name}”",
+    "forget": "Forgetting a person everywhere",
     "export": "Export “{name}”",
     "profile": "Cost of “{name}”",
     "verify": "Verify “{name}”",

@@ -16,6 +16,7 @@ from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, St
 from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, page_texts, tag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BACKUPS, DATASETS, DISCARDED
+from plushsense.studio.pages.home.forgetting import receipt_text
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
 from plushsense.studio.widgets.elements import (
     JOB_STATES,
@@ -344,10 +345,12 @@ class JobList:
             link = ui.link(words("Download"), download_address(BACKUPS, place.stem)).classes("ps-link")
             tag(link.props("download"), "download")
         if job.task == "forget":
-            removed = words(
-                "The person is removed, with {n} files. Delete what remains elsewhere, too.", n=result["files"]
-            )
-            ui.label(removed)
+            ui.label(words("Removed for good: {n}. Not removed: {left}.", n=result["removed"], left=result["left"]))
+            # The receipt names the person, so that it is not stored.
+            if receipt := result.get("receipt"):
+                text, file = receipt_text(page, receipt, job.ended_s), f"{words('receipt')}.txt"
+                save = words("Save the receipt")
+                button("receipt", save, lambda: ui.download.content(text, file), SMALL, icon="download")
         if job.task in ("import", "simulate", "restore"):
             people = result.get("subjects", result.get("people", 0))
             facts = [words("recordings: {n}", n=result["recordings"]), words("people: {n}", n=people)]
