@@ -168,7 +168,7 @@ def _bundles(places: Iterable[Path]) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class Trace:
+class PersonTrace:
     """Something in a home that names a person or was computed from their recordings, and can be removed.
 
     Attributes:
@@ -202,7 +202,7 @@ class HomeTraces:
     """
 
     person: str
-    traces: tuple[Trace, ...]
+    traces: tuple[PersonTrace, ...]
     mentions: tuple[Path, ...] = ()
     pseudonyms: tuple[str, ...] = ()
     published: tuple[str, ...] = ()
@@ -213,9 +213,9 @@ class RemovalReceipt:
     """What was removed of a person, what was kept, and what could not be removed, with the reason."""
 
     found: HomeTraces
-    removed: tuple[Trace, ...]
-    kept: tuple[Trace, ...]
-    failed: tuple[tuple[Trace, Message], ...]
+    removed: tuple[PersonTrace, ...]
+    kept: tuple[PersonTrace, ...]
+    failed: tuple[tuple[PersonTrace, Message], ...]
 
     def to_json(self) -> dict[str, object]:
         """Return plain values for JSON; each trace is the list of its kind and path."""
@@ -306,13 +306,13 @@ def find_traces(home: Path, person: str, given: Iterable[Path] = ()) -> HomeTrac
     traces += _traces_of_sessions(files.people, person)
     traces += _traces_of_models(files, person, traces)
     traces += _traces_of_archives(files, codes)
-    traces += [Trace("key", path, person) for path in keys]
+    traces += [PersonTrace("key", path, person) for path in keys]
     listed = {path for trace in traces for path in (trace.path, *trace.parts)}
     files_left = [path for path in (*files.others, *files.archives) if path not in listed]
     naming = [path for path in files_left if mentions(path, person)]
     for folder in (home / name for name in NOTES):
         if notes := tuple(path for path in naming if path.parent == folder):
-            traces.append(Trace("notes", folder, person, notes, len(notes)))
+            traces.append(PersonTrace("notes", folder, person, notes, len(notes)))
             listed.update(notes)
     order = list(REMOVALS)
     traces.sort(key=lambda t: (order.index(t.kind), t.path))
@@ -320,9 +320,11 @@ def find_traces(home: Path, person: str, given: Iterable[Path] = ()) -> HomeTrac
     return HomeTraces(person, tuple(traces), tuple(named), codes[1:], tuple(published))
 
 
-def _traces_of_datasets(folders: Iterable[Path], codes: tuple[str, ...]) -> tuple[list[Trace], list[Path], list[str]]:
+def _traces_of_datasets(
+    folders: Iterable[Path], codes: tuple[str, ...]
+) -> tuple[list[PersonTrace], list[Path], list[str]]:
     """Return the data sets with a person, the files in them that stay and contain the code, and the DOIs."""
-    traces, named, published = list[Trace](), list[Path](), list[str]()
+    traces, named, published = list[PersonTrace](), list[Path](), list[str]()
     for folder in folders:
         there = people_of_dataset(folder)
         others = [c for c in there if c not in codes and normalize_code(c) == normalize_code(codes[0])]
@@ -333,32 +335,32 @@ def _traces_of_datasets(folders: Iterable[Path], codes: tuple[str, ...]) -> tupl
                 continue
             if not plan.absent or plan.evaluations:
                 count = len(plan.files) + len(plan.evaluations)
-                traces.append(Trace("dataset", folder, code, count=count, certain=code in codes))
+                traces.append(PersonTrace("dataset", folder, code, count=count, certain=code in codes))
                 published += [plan.published] if plan.published else []
                 named += [folder / path for path in plan.mentions]
     return traces, named, published
 
 
-def _traces_of_sessions(folders: Iterable[Path], person: str) -> Iterator[Trace]:
+def _traces_of_sessions(folders: Iterable[Path], person: str) -> Iterator[PersonTrace]:
     """Yield the folders of a person, which hold sessions or other files."""
     for folder in folders:
         kind = "sessions" if any(folder.glob(f"*/{SESSION_HEAD}")) else "folder"
         count = sum(1 for path in folder.rglob("*") if path.is_file())
-        yield Trace(kind, folder, person, (folder,), count, folder.name == person or kind == "folder")
+        yield PersonTrace(kind, folder, person, (folder,), count, folder.name == person or kind == "folder")
 
 
-def _traces_of_models(files: _HomeFiles, person: str, known: Iterable[Trace]) -> list[Trace]:
+def _traces_of_models(files: _HomeFiles, person: str, known: Iterable[PersonTrace]) -> list[PersonTrace]:
     """Return the networks that read a person, and what was exported from them, or may have been."""
-    traces, hashes = list[Trace](), set[object]()
+    traces, hashes = list[PersonTrace](), set[object]()
     for path in files.bundles:
         try:
             bundle = Bundle.load(path)
         except BundleError:
-            traces.append(Trace("network", path, person, (path,), certain=False))
+            traces.append(PersonTrace("network", path, person, (path,), certain=False))
             continue
         if people := [code for code in _people_of_bundle(bundle) if _is_of(code, person)]:
             hashes.add(bundle.provenance.get("dataset_hash"))
-            traces.append(Trace("network", path, person, (path,), certain=person in people))
+            traces.append(PersonTrace("network", path, person, (path,), certain=person in people))
     names = {DatasetHead.read(t.path).name for t in known if t.kind == "dataset"}
     for folder in files.exports:
         try:
@@ -367,22 +369,22 @@ def _traces_of_models(files: _HomeFiles, person: str, known: Iterable[Trace]) ->
             origin = {}
         certain = origin.get("dataset_hash") in hashes
         if certain or not origin or origin.get("dataset") in names:
-            traces.append(Trace("export", folder, person, (folder,), certain=certain))
+            traces.append(PersonTrace("export", folder, person, (folder,), certain=certain))
     return traces
 
 
-def _traces_of_archives(files: _HomeFiles, codes: tuple[str, ...]) -> Iterator[Trace]:
+def _traces_of_archives(files: _HomeFiles, codes: tuple[str, ...]) -> Iterator[PersonTrace]:
     """Yield the packages and backups that hold a person; ``codes`` are the person's own one, then those in packages."""
     for path in files.archives:
         held = [c for c in backup_people(path) if _is_of(c, codes[0])] if is_backup(path) else []
         if held:
-            yield Trace("backup", path, codes[0], (path,), certain=codes[0] in held)
+            yield PersonTrace("backup", path, codes[0], (path,), certain=codes[0] in held)
     packed = [path for path in files.archives if not is_backup(path) and CHECKSUMS in _members(path)]
     for path in (*files.packages, *packed):
         parts = {part for member in _members(path) for part in PurePath(member).parts}
         certain = bool(parts & set(codes))
         if certain or any(_is_of(part, codes[0]) for part in parts):
-            yield Trace("package", path, codes[0], (path,), certain=certain)
+            yield PersonTrace("package", path, codes[0], (path,), certain=certain)
 
 
 def _codes_of_key(path: Path) -> Mapping[str, str]:
@@ -410,7 +412,7 @@ def forget_everywhere(home: Path, person: str, chosen: Collection[str], given: I
     """Remove what is chosen of the traces of a person in a home; this cannot be undone. The home remembers the code.
 
     Args:
-        chosen: the `Trace.id` of what to remove.
+        chosen: the `PersonTrace.id` of what to remove.
         given: data sets elsewhere, in which to look as well.
 
     Returns:
@@ -418,7 +420,7 @@ def forget_everywhere(home: Path, person: str, chosen: Collection[str], given: I
     """
     found = find_traces(home, person, given)
     remember_removed(home, person)
-    removed, failed = list[Trace](), list[tuple[Trace, Message]]()
+    removed, failed = list[PersonTrace](), list[tuple[PersonTrace, Message]]()
     for trace in (t for t in found.traces if t.id in chosen):
         try:
             REMOVALS[trace.kind](trace)
@@ -426,13 +428,14 @@ def forget_everywhere(home: Path, person: str, chosen: Collection[str], given: I
         except PlushSenseError as refusal:
             failed.append((trace, refusal.message))
         except OSError as cause:
-            failed.append((trace, Message("The computer refused: {why}{where}.", why=cause.strerror or str(cause), where="")))
+            why = Message("The computer refused: {why}{where}.", why=cause.strerror or str(cause), where="")
+            failed.append((trace, why))
     kept = tuple(t for t in found.traces if t.id not in chosen)
     found = replace(found, mentions=tuple(path for path in found.mentions if path.exists()))
     return RemovalReceipt(found, tuple(removed), kept, tuple(failed))
 
 
-def _delete(trace: Trace) -> None:
+def _delete(trace: PersonTrace) -> None:
     for path in trace.parts:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -440,7 +443,7 @@ def _delete(trace: Trace) -> None:
             path.unlink(missing_ok=True)
 
 
-def _delete_sessions(trace: Trace) -> None:
+def _delete_sessions(trace: PersonTrace) -> None:
     """Delete the sessions of a person; raise DatasetError if one is being recorded."""
     for head in trace.path.glob(f"*/{SESSION_HEAD}"):
         try:
@@ -450,11 +453,11 @@ def _delete_sessions(trace: Trace) -> None:
     _delete(trace)
 
 
-def _remove_from_dataset(trace: Trace) -> None:
+def _remove_from_dataset(trace: PersonTrace) -> None:
     remove_person(trace.path, trace.person)
 
 
-def _remove_from_key(trace: Trace) -> None:
+def _remove_from_key(trace: PersonTrace) -> None:
     """Remove the line of a person from the key of a publication."""
     with FileLock(trace.path.with_name(f"{trace.path.name}.lock")):
         key = open_key(trace.path)
@@ -465,7 +468,7 @@ def _remove_from_key(trace: Trace) -> None:
 NOTES = ("work", "selections")
 """Folders of a home with notes of the studio, which may be deleted: records of jobs, selections of recordings."""
 _LARGEST_KEY = 1 << 20
-REMOVALS: dict[str, Callable[[Trace], None]] = {
+REMOVALS: dict[str, Callable[[PersonTrace], None]] = {
     "dataset": _remove_from_dataset,
     "sessions": _delete_sessions,
     "network": _delete,

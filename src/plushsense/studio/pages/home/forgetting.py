@@ -14,7 +14,7 @@ from plushsense.studio.app.shell import Page, button, heading, named, on_page, t
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import DISCARDED, Workspace
 from plushsense.studio.widgets.elements import folded_lines, on_enter, open_dialog
-from plushsense.workflow.forgetting import HomeTraces, Trace, find_traces, people_of_home
+from plushsense.workflow.forgetting import HomeTraces, PersonTrace, find_traces, people_of_home
 
 _KINDS: Texts = {
     "dataset": "Data set “{name}”: recordings, marks and evaluations of this person",
@@ -56,7 +56,7 @@ class ForgetDialog:
         self._page, self._words, self._jobs, self._workspace = page, page.words, jobs, page.workspace
         home = self._workspace.folder
         self._given = [path for path in self._workspace.given if home not in path.parents]
-        self._ticks: list[tuple[Trace, ui.checkbox]] = []
+        self._ticks: list[tuple[PersonTrace, ui.checkbox]] = []
 
     async def open(self) -> None:
         """Open the dialog with the choice of the person."""
@@ -113,7 +113,7 @@ class ForgetDialog:
         on_enter(code, on_page(remove))
         button("forget-go", words("Remove for good"), on_page(remove), "unelevated color=negative")
 
-    def _tick(self, trace: Trace) -> ui.checkbox:
+    def _tick(self, trace: PersonTrace) -> ui.checkbox:
         words = self._words
         text = _trace_text(words, self._workspace, trace.kind, trace.path)
         text += f" · {words('files: {n}', n=trace.count)}" if trace.count > 1 else ""
