@@ -121,7 +121,7 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     state(page, "stopped")
     marked(page, "resume").click()
     done = state(page, "done")
-    verdict = done.locator('[data-test="verdict"]').inner_text()
+    verdict = done.locator('[data-test="score"]').inner_text()
     assert re.fullmatch(
         r"It reads about [\d.]+ of 10 touches of people it never met; guessing gives 0.6 of 10.", verdict
     )
@@ -201,7 +201,7 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(studio: Fixture, look: F
     # The plot beneath shows each person; their mean is the figure of the sentence.
     bars = dict(row.split("\t")[:2] for row in done.locator("[data-test=people-bars] tbody tr").all_inner_texts())
     assert len(bars) == 8 and bars["Mean"] == figure
-    assert done.locator('[data-test="verdict"]').inner_text().startswith("It reads about ")
+    assert done.locator('[data-test="score"]').inner_text().startswith("It reads about ")
     assert done.get_by_text("This figure is uncertain: it was measured on only 6 people.").is_visible()
     done.locator('[data-test="open-result"]').click()
     page.locator("[data-cell]").first.wait_for()
@@ -338,7 +338,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(studio: Fixture, 
     assert axe(page) == []
     marked(page, "start").click()
     done = state(page, "done")
-    assert "but this test is too easy" in done.locator('[data-test="verdict"]').inner_text()
+    assert "but this test is too easy" in done.locator('[data-test="score"]').inner_text()
     done.get_by_text("leaky", exact=True).first.wait_for()
     drawn = marked(page, "pareto")
     drawn.wait_for()
@@ -442,7 +442,7 @@ def test_one_button_makes_a_network_that_a_stop_does_not_lose(studio: Fixture, l
     marked(page, "resume").click()
     done = state(page, "done")
     assert network.read_bytes() == saved
-    assert "No 10 pieskārieniem, ko veic tīklam sveši cilvēki" in done.locator('[data-test="verdict"]').inner_text()
+    assert "No 10 pieskārieniem, ko veic tīklam sveši cilvēki" in done.locator('[data-test="score"]').inner_text()
     assert done.get_by_text("pārbaudē piedalījās tikai 3 cilvēki").is_visible()
     assert done.get_by_text("Nav mērīts, ko dotu vairāk cilvēku.").is_visible()
     assert done.get_by_text("simulācija", exact=True).is_visible()

@@ -364,13 +364,13 @@ def query() -> dict[str, str]:
     return dict(request.query_params) if request is not None else {}
 
 
-def query_path(workspace: Workspace, key: str, allowed: Iterable[str]) -> str:
-    """Return the path in the query parameter ``key`` if it is allowed, else the first allowed path, or ""."""
+def query_path(workspace: Workspace, key: str, allowed: Iterable[str], default: str | None = None) -> str:
+    """Return the path in the query parameter ``key`` if it is allowed, else ``default``, the first path or ""."""
     paths = list(allowed)
     with suppress(PlushSenseError):
         if (path := str(workspace.inside(query().get(key, "")))) in paths:
             return path
-    return next(iter(paths), "")
+    return next(iter(paths), "") if default is None else default
 
 
 def set_address(path: str) -> None:

@@ -10,9 +10,7 @@ from nicegui import ui
 
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, section, tag
-from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.job_requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
-from plushsense.studio.pages.train.stored_results import (
+from plushsense.studio.app.stored_results import (
     LINKS,
     ResultRow,
     StoredResults,
@@ -20,8 +18,10 @@ from plushsense.studio.pages.train.stored_results import (
     duration_text,
     score_labels,
 )
-from plushsense.studio.pages.train.verdict import figures, headline, limits, people_table
+from plushsense.studio.app.words import Texts, Words
+from plushsense.studio.pages.train.job_requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
 from plushsense.studio.widgets.elements import JOB_STATES, KINDS_OF_TRAINING, Plot
+from plushsense.studio.widgets.verdict import figures, limits, people_table, show_verdict
 
 _CURVES_ABOUT: Texts = {
     "make": (
@@ -260,10 +260,11 @@ class _Card:
     def _plot(self, chart: ProgressChart) -> None:
         w = self._words
         title = w(_METRICS[chart.metric])
-        unit = {LOSS: "", ACCURACY: " (0–1)", BEST: " (0–1)"}[chart.metric]
+        share = chart.metric != LOSS
         x = w("Trainings done") if chart.metric == BEST else w("Epoch")
         drawn = self._lines(chart)
-        plot = Plot(f"{title}: {self._job.title}", drawn, x=x, y=title + unit, height=220)
+        label, y = f"{title}: {self._job.title}", f"{title} (0–1)" if share else title
+        plot = Plot(label, drawn, x=x, y=y, height=220, share=share)
         tag(plot, f"curve-{chart.metric}").begin(chart.x, chart.lines)
         self._plots.append((chart.metric, plot, chart.names))
 
@@ -298,10 +299,10 @@ class _Card:
         if len(job.warnings) != self._warned:
             self._warned = len(job.warnings)
             self._warnings.clear()
-            if job.warnings:
-                with self._warnings, ui.expansion(w("Good to know ({n})", n=len(job.warnings)), icon="info") as more:
+            if sentences := warning_texts(w, job):
+                with self._warnings, ui.expansion(w("Good to know ({n})", n=len(sentences)), icon="info") as more:
                     tag(more.classes("w-full"), "warnings")
-                    for sentence in warning_texts(w, job):
+                    for sentence in sentences:
                         ui.label(f"• {sentence}").classes("ps-break")
 
     def _buttons(self) -> None:
@@ -339,7 +340,7 @@ class _Card:
         marks = score_labels(w, row.leaky, row.simulated)
         if marks:
             tag(html(marks), "marks")
-        tag(ui.label(headline(w, row)).classes("ps-verdict-text"), "verdict")
+        show_verdict(w, row, "ps-verdict-text")
         for sentence in limits(w, row):
             ui.label(sentence)
         if row.simulated:

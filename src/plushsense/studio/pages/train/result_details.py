@@ -22,8 +22,7 @@ from plushsense.studio.app.shell import (
     scroll_region,
     tag,
 )
-from plushsense.studio.app.words import Words
-from plushsense.studio.pages.train.stored_results import (
+from plushsense.studio.app.stored_results import (
     EVALUATION,
     HELD_BACK,
     LINKS,
@@ -42,8 +41,9 @@ from plushsense.studio.pages.train.stored_results import (
     score_text,
     split_text,
 )
-from plushsense.studio.pages.train.verdict import figures, headline, limits
+from plushsense.studio.app.words import Words
 from plushsense.studio.widgets.elements import table_html
+from plushsense.studio.widgets.verdict import figures, limits, show_verdict
 
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
 
@@ -84,7 +84,7 @@ class ResultDetailsView:
                 icon_button("close", w("Close"), self._close, color=None)
             if row.leaky:
                 ui.label(leaky_warning(w))
-            tag(ui.label(headline(w, row)).classes("text-bold"), "details-verdict")
+            show_verdict(w, row, "text-bold")
             for sentence in limits(w, row):
                 ui.label(sentence)
             tag(ui.label(figures(w, row)).classes("ps-dim"), "details-figures")
