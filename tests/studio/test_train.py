@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import json
 import os
 import re
@@ -287,6 +288,62 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(studio: Fixture, look: F
         body = page.locator("#content").inner_text()
         assert re.findall(r"by-subject|validation|held back|windows:|\b0\.\d|\bpeople\b", body) == []
         assert later.complaints == []
+
+
+@pytest.mark.exhaustive
+def test_what_a_researcher_takes_away(studio: Fixture, look: Fixture, light: Path) -> None:
+    pytest.importorskip("polars")
+    dataset = light / "datasets" / "virtual"
+    first, second = (dataset / "evaluations" / name for name in ("first", "second"))
+    evaluate_apart(dataset, first, "--split", "by-subject:2", "--context", "loop", "--epochs", "12")
+    shutil.copytree(first, second)
+    # The other network reads each person a little worse: six of six, which is beyond chance.
+    table = json.loads((second / "evaluation.json").read_text(encoding="utf-8"))
+    table["config"]["training"]["seed"], table["id"] = 7, "other"
+    for row in table["subjects"]:
+        row["accuracy"] -= 0.0625
+    (second / "evaluation.json").write_text(json.dumps(table), encoding="utf-8")
+    here = studio(home=light)
+    browser = look()
+    page = browser.open(f"{here.url}/train")
+    page.locator('tr[data-row$="/first"] [data-do^="open:"]').click()
+    saved = {}
+    for kind_of in ("html", "csv", "png"):
+        with page.expect_download() as loaded:
+            marked(page, f"save-{kind_of}").click()
+        assert loaded.value.suggested_filename.endswith(f".{kind_of}")
+        saved[kind_of] = Path(loaded.value.path()).read_bytes()
+    assert saved["html"] == (first / "report.html").read_bytes()
+    assert saved["png"].startswith(b"\x89PNG")
+    head, *rows = csv.reader(saved["csv"].decode().splitlines())
+    assert {"labels": [r[0] for r in rows], "counts": [[int(n) for n in r[1:]] for r in rows]} == table["confusion"]
+    assert head == ["true", *table["confusion"]["labels"]]
+
+    choose(page, "compare-with", "people, 12")
+    said = marked(page, "comparison")
+    said.get_by_text("Compared on 6 people").wait_for()
+    assert "reads 6 of them better than the other one, and 0 worse. Its accuracy minus" in said.inner_text()
+    assert "is 0.063 on average" in said.inner_text() or "is 0.062 on average" in said.inner_text()
+    assert said.inner_text().endswith("p = 0.031). So this network is better, beyond chance.")
+    assert axe(page) == []
+
+    # One click: a network with these settings, trained on everybody, and its C; it has the score of the evaluation.
+    score = marked(page, "details").locator('[data-test="score"]').inner_text()
+    marked(page, "make-export").click()
+    done = state(page, "done")
+    assert done.locator('[data-test="score"]').inner_text() == score
+    done.locator('[data-test="to-exported"]').click()
+    marked(page, "export-facts").wait_for()
+    (made,) = (light / "exports").iterdir()
+    assert (made / "plush_model.c").is_file()
+    page.goto(f"{here.url}/train")
+    page.locator('tr[data-row$="/first"] [data-do^="open:"]').click()
+    with page.expect_download() as loaded:
+        marked(page, "save-plush").click()
+    bundle = light / "bundles" / "virtual toy.plush"
+    assert Path(loaded.value.path()).read_bytes() == bundle.read_bytes()
+    assert marked(page, "make-export").count() == 0, "there is one"
+    assert browser.complaints == []
 
 
 AFFECTS = {

@@ -28,7 +28,7 @@ from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import Workspace, file_stamps
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.preparation import WHOLE_PEOPLE
-from plushsense.workflow.reporting import LEARNING, PREDICTIONS, SCORES, load_evaluation
+from plushsense.workflow.reporting import LEARNING, PAGE, PREDICTIONS, SCORES, load_evaluation
 
 _OVER: Texts = {"trainings": "{n} (folds × seeds)", "held_back": "{n} held back"}
 _MARKS: Texts = {"simulation": "simulation", "leaky": "leaky"}
@@ -50,9 +50,6 @@ _CONTEXTS: Texts = {
     "anywhere": "for live use",
     "inside": "within the gesture",
 }
-
-LINKS: Texts = {"live": "Try it live", "export": "Export for the toy"}
-"""Links from a network to the pages that use it."""
 
 
 def figure(words: Words, value: float | None) -> str:
@@ -161,6 +158,7 @@ class ResultRow:
         apart: further values that are equal in comparable results: hash of the data set, classes, held-back people.
         settings: hash of the data set and all settings of the training; equal for a network and its evaluation.
         proof: folder of the evaluation that gives the score; None if it is that of a training or a trial.
+        bundle: the network, of an evaluation the newest one with its settings; None if there is none.
     """
 
     id: str
@@ -194,6 +192,7 @@ class ResultRow:
     learning: dict[str, Any] | None = None
     settings: str = ""
     proof: Path | None = None
+    bundle: Path | None = None
 
     @property
     def usable(self) -> bool:
@@ -204,6 +203,11 @@ class ResultRow:
     def apart_people(self) -> bool:
         """Whether nobody in the test was trained on."""
         return self.split.startswith(("leave-one-subject-out", "by-subject", WHOLE_PEOPLE))
+
+    @property
+    def paired(self) -> bool:
+        """Whether there are scores of several people, none of whom was trained on."""
+        return self.proof is not None and self.apart_people and len(self.people) > 1
 
     def __post_init__(self) -> None:
         """Raise ValueError if a value, which a file may have given, has another type or range."""
@@ -349,7 +353,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
     bundle = Bundle.load(path)
     origin = bundle.provenance
     # What is known about a network before it was adapted to a person does not hold for it.
-    scores = {"split": PERSONAL} if bundle.personal else origin.get("scores", {})
+    scores: dict[str, Any] = {"split": PERSONAL} if bundle.personal else origin.get("scores", {})
     arch, training = bundle.arch, origin.get("training", {})
     name = str(origin.get("dataset", "?"))
     split = str(scores.get("split", origin.get("split", "?")))
@@ -393,6 +397,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             score_interval(scores.get("accuracy"), trials),
             rest=_rest(scores.get("nobody"), split == WHOLE_PEOPLE),
             settings="" if bundle.personal else _settings(*used),
+            bundle=path,
         )
     ]
 
@@ -401,7 +406,7 @@ def _proven(row: ResultRow, proof: ResultRow | None) -> ResultRow:
     """Return the result of a network, with the score of the evaluation of its settings if there is one."""
     if proof is None or proof.apart[1:] != row.apart[1 : 1 + row.classes]:
         return row
-    return replace(proof, id=row.id, kind=TRAINING, path=row.path, when_s=row.when_s)
+    return replace(proof, id=row.id, kind=TRAINING, path=row.path, when_s=row.when_s, bundle=row.path)
 
 
 def _rest(nobody: Mapping[str, Any] | None, apart: bool) -> float | None:
@@ -456,6 +461,7 @@ class ResultDetails:
     clickable: bool = False
     later: bool = False
     pooled: float | None = None
+    report: Path | None = None
     facts: dict[str, Any] = field(default_factory=dict)
 
 
@@ -501,7 +507,22 @@ class StoredResults:
         for row in sorted(rows, key=lambda row: (row.apart_people, row.split.startswith("leave-one"), row.when_s)):
             if row.kind == EVALUATION and not row.leaky:
                 proofs[row.settings] = row
-        return [_proven(row, proofs.get(row.settings)) if row.kind == TRAINING else row for row in rows]
+        bundles = {row.settings: row.path for row in reversed(rows) if row.kind == TRAINING}
+        return [
+            _proven(row, proofs.get(row.settings))
+            if row.kind == TRAINING
+            else replace(row, bundle=bundles.get(row.settings) if row.settings else None)
+            for row in rows
+        ]
+
+    def comparable(self, row: ResultRow) -> list[ResultRow]:
+        """Return the other evaluations that can be compared with that of ``row`` person by person."""
+        return [
+            other
+            for other in self.rows()
+            if other.kind == EVALUATION and other.proof != row.proof and other.paired and row.paired
+            if (other.apart, other.context.split()[-1]) == (row.apart, row.context.split()[-1])
+        ]
 
     def networks(self) -> dict[Path, ResultRow]:
         """Return the result of each readable bundle, the newest first."""
@@ -553,6 +574,7 @@ class StoredResults:
                 tuple(map(_scores_of_person, table["subjects"])),
                 (row.proof / PREDICTIONS).is_file(),
                 facts=facts or {"code_version": table["code_version"], "hash": table["dataset"]["hash"]},
+                report=report if (report := self._inside(row.proof / PAGE)).is_file() else None,
                 pooled=replace(row, accuracy=table["pooled"]["accuracy"]).accuracy,
             )
         if row.kind == TRIAL:

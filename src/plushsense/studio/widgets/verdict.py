@@ -9,7 +9,8 @@ from typing import Any
 from markupsafe import Markup
 from nicegui import ui
 
-from plushsense.studio.app.shell import tag
+from plushsense.scoring.comparison import LEVEL, PairResult
+from plushsense.studio.app.shell import address, tag
 from plushsense.studio.app.stored_results import (
     HELD_BACK,
     PERSONAL,
@@ -43,6 +44,15 @@ _VERDICTS: Texts = {
     "unusable": "Not usable yet, because it may be guessing: record two more people, or each gesture two more times.",
 }
 
+_LINKS: Texts = {"live": "Try it live", "export": "Export for the toy"}
+_OUTCOMES: Texts = {
+    "this": "So this network is better, beyond chance.",
+    "other": "So the other network is better, beyond chance.",
+    "chance": "So the difference may be chance.",
+    "few": "So the difference may be chance: with so few people, this test cannot tell.",
+}
+FEW_PAIRS = 6
+"""With fewer people than this, a paired permutation test never gives a p-value below 0.05."""
 FEW_PEOPLE = 10
 """With fewer people than this, a score may be far from that of others."""
 
@@ -79,6 +89,33 @@ def show_choice(w: Words, networks: Mapping[Path, ResultRow], chosen: str | None
         show_verdict(w, networks.get(Path(chosen)), look)
     elif networks:
         tag(ui.label(w("None of the networks is surely better than guessing, so none is chosen.")), "none-chosen")
+
+
+def network_links(w: Words, bundle: str | Path) -> None:
+    """Add links from a network to the pages that use it."""
+    for to, message in _LINKS.items():
+        tag(ui.link(w(message), address(to, model=bundle)).classes("ps-link"), f"to-{to}")
+
+
+def comparison(w: Words, pair: PairResult, people: int) -> str:
+    """Return the sentences on two networks that were tested on the same people; the first is "this network"."""
+    assert pair.difference.mean is not None and pair.difference.ci95 is not None
+    low, high = pair.difference.ci95
+    text = w(
+        "Compared on {people}: this network reads {better} of them better than the other one, and {worse} worse. Its "
+        "accuracy minus that of the other one is {difference} on average (95 % interval: {low} to {high}; paired "
+        "permutation test over people: p = {p}).",
+        people=counted(w, "people", people),
+        better=pair.better,
+        worse=pair.worse,
+        p=w.number(pair.p, 3),
+        difference=figure(w, pair.difference.mean),
+        low=figure(w, low),
+        high=figure(w, high),
+    )
+    better = "this" if pair.difference.mean > 0 else "other"
+    outcome = better if pair.p < LEVEL else "few" if people < FEW_PAIRS else "chance"
+    return f"{text} {w(_OUTCOMES[outcome])}"
 
 
 def limits(w: Words, row: ResultRow) -> list[str]:

@@ -11,7 +11,6 @@ from nicegui import ui
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, section, tag
 from plushsense.studio.app.stored_results import (
-    LINKS,
     ResultRow,
     StoredResults,
     counted,
@@ -21,7 +20,7 @@ from plushsense.studio.app.stored_results import (
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.train.job_requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
 from plushsense.studio.widgets.elements import JOB_STATES, KINDS_OF_TRAINING, Plot
-from plushsense.studio.widgets.verdict import figures, limits, people_table, show_verdict
+from plushsense.studio.widgets.verdict import figures, limits, network_links, people_table, show_verdict
 
 _CURVES_ABOUT: Texts = {
     "make": (
@@ -58,6 +57,8 @@ _STAGES: Texts = {
     "refitting": "training again, on everybody",
     "fine-tuning": "fine-tuning for 8 bits",
     "deciding": "fitting the decision settings",
+    "export": "writing the export",
+    "profile": "measuring the cost of a step",
     "evaluating": "testing on people left out",
     "learning": "measuring what more people would add",
 }
@@ -285,7 +286,7 @@ class _Card:
         job, w = self._job, self._words
         if self._bar is not None and self._text is not None:
             at = job.progress
-            self._bar.set_value(min(1.0, float(at.get("share") or 0.0)))
+            self._bar.set_value(min(1.0, float(at.get("share", 1.0 if at else 0.0))))
             text = _progress_text(w, at)
             if self._text.text != text:
                 self._text.set_text(text)
@@ -373,9 +374,11 @@ class _Card:
         job, w = self._job, self._words
         bundle = job.result.get("bundle") or _saved_bundle(job)
         if bundle and Path(bundle).is_file():
-            for to, text in LINKS.items():
-                link = ui.link(w(text), address(to, model=bundle)).classes("ps-link")
-                tag(link, f"to-{to}")
+            network_links(w, bundle)
+        place = Path(job.spec.get("place", ""))
+        if "files" in job.result and place.is_dir():
+            link = ui.link(w("Export “{name}”", name=place.name), address("export", name=place.name))
+            tag(link.classes("ps-link"), "to-exported")
 
 
 def _saved_bundle(job: StudioJob) -> str:

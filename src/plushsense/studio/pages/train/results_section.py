@@ -314,8 +314,8 @@ def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, object]:
     for row in rows:
         if row.macro_f1_sd is not None:
             score = row.macro_f1 or 0.0
-            ends = (max(0.0, score - row.macro_f1_sd), min(1.0, score + row.macro_f1_sd))
-            bars += [*([row.parameters, end] for end in ends), [None, None]]
+            low, high = max(0.0, score - row.macro_f1_sd), min(1.0, score + row.macro_f1_sd)
+            bars += [[row.parameters, low], [row.parameters, high], [None, None]]
     points = [_point(w, row, row.id in ids, math.sqrt(low_x * high_x)) for row in rows]
     line = {"type": "line", "showSymbol": False, "silent": True, "emphasis": {"disabled": True}}
     return {
