@@ -112,9 +112,9 @@ class ToySection:
                 return "error", words.error(error)
             return "error", words.failure(" ".join(str(error).split()) or type(error).__name__)
         assert result is not None
-        values = {"frames": result.frames, "layout": result.layout, "malformed": result.malformed}
+        values = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
         key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
-        values |= {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
+        values |= {"frames": str(result.frames), "layout": result.layout, "malformed": str(result.malformed)}
         return ("good" if key == "good" else "warning"), words(_TESTS[key], **values)
 
     def _show_others(self) -> None:
