@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from plushsense.core.errors import ConfigError, DatasetError, LayoutError
+from plushsense.core.errors import ConfigError, DatasetError, LayoutError, PlushSenseError
 from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.sentences import Message
 from plushsense.core.toml import builtin_names
@@ -125,6 +126,12 @@ class RecordController:
         """Return the active session with this name, or None."""
         with self._lock:
             return self._active.get(name)
+
+    def exists(self, name: str) -> bool:
+        """Return whether there is a session with this name, open or closed."""
+        with contextlib.suppress(PlushSenseError):
+            return self._folder(name).is_dir()
+        return False
 
     def sessions(self) -> list[SessionSummary]:
         """Return all sessions in the studio's folder, newest first."""

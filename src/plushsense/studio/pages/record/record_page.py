@@ -13,10 +13,10 @@ from nicegui import run, ui
 from plushsense.core.errors import AddressError, ConfigError, DeviceError, LayoutError, PlushSenseError
 from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary
-from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
+from plushsense.studio.app.shell import CHILD, Page, address, button, html, named, query, tag
 from plushsense.studio.app.toys import toy_title
 from plushsense.studio.app.words import Texts
-from plushsense.studio.pages.record.child import CHILD, show_child
+from plushsense.studio.pages.record.child import show_child
 from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session_page import collect, show_session

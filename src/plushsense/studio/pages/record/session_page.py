@@ -15,9 +15,9 @@ from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import SessionHead
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
-from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.shell import CHILD, Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.record.child import CHILD, ConnectionAlert, gesture_picture, style
+from plushsense.studio.pages.record.child import ConnectionAlert, gesture_picture, style
 from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.last_recording import ResultPanel
@@ -226,16 +226,15 @@ class _View:
                 self._small[key] = button(name, text).style("min-height: 48px")
                 on_click(self._small[key], partial(self._press, key))
             self._change_toy = button("change-toy", words("Another toy"), self._ask_toy, "flat")
-            # The space bar must not start a recording where it seems to press this button.
-            self._end_button = button("end", words("End the session"), self._ask_end, "flat data-own-keys")
+            self._end_button = button("end", words("End the session"), self._ask_end, "flat")
             for late in (self._change_toy, self._end_button):
                 late.style("min-height: 48px")
-        ending = ui.row().classes("ps-message ps-message-warning w-full items-center").props("data-own-keys")
+        ending = ui.row().classes("ps-message ps-message-warning w-full items-center")
         with tag(ending, "ending") as self._ending:
             self._end_text = ui.label().classes("flex-grow")
             button("end-yes", words("End it"), lambda: self._end(), "unelevated", color="deep-orange-10")
             self._no = button("end-no", words("Stay"), self._stay, color=None)
-        exchange = ui.row().classes("ps-card w-full items-start").props("data-own-keys")
+        exchange = ui.row().classes("ps-card w-full items-start")
         with tag(exchange, "exchange") as self._exchange:
             about = words(
                 "The session goes on with another toy of the same sensor layout. It is tried first. Everything "
@@ -296,7 +295,7 @@ class _View:
             self._session.recorder.note(text)
             self._note.value = ""
         # Leave the note field, so that the space bar is a command again.
-        focus(self._main)
+        ui.run_javascript("document.activeElement?.blur()")
 
     def _ask_end(self) -> None:
         words = self._page.words
