@@ -135,6 +135,8 @@ E = TypeVar("E", bound=ui.element)
 Kind = Literal["info", "good", "warning", "error"]
 
 _CSS = Path(__file__).with_name("studio.css")
+# The browser has drawn what was sent before.
+_DRAWN_MS = 60
 
 
 def page_texts(name: str) -> PageTexts:
@@ -145,13 +147,19 @@ def page_texts(name: str) -> PageTexts:
 
 @dataclass
 class Page:
-    """An open page: its workspace, its texts, and the place where messages appear."""
+    """An open page: its workspace, its texts, and the places where messages and the progress of jobs appear."""
 
     workspace: Workspace
     name: str
     words: Words
     dark: bool
+    work: ui.element | None = None
     _messages: Any = None
+
+    def show_work(self) -> None:
+        """Reveal the progress of the job that was just started."""
+        if self.work is not None:
+            reveal(self.work)
 
     def say(self, sentence: str, kind: Kind = "info", undo: Callable[[], Any] | None = None) -> None:
         """Show a message at the top of the page and announce it to screen readers; "" removes the message.
@@ -471,3 +479,10 @@ def icon_button(
 def focus(element: ui.element) -> None:
     """Move the keyboard focus to an element as soon as it is displayed."""
     ui.run_javascript(f"setTimeout(() => getHtmlElement({element.id})?.focus())")
+
+
+def reveal(element: ui.element) -> None:
+    """Scroll to the effect of a click as soon as it is displayed, and move the keyboard focus there."""
+    at = f"const at = getHtmlElement({element.id})"
+    go = "if (at) { at.tabIndex = -1; at.focus({ preventScroll: true }); at.scrollIntoView(); }"
+    ui.run_javascript(f"setTimeout(() => {{ {at}; {go} }}, {_DRAWN_MS})")

@@ -67,11 +67,6 @@ def style() -> None:
     add_style(_CSS.read_text(encoding="utf-8"))
 
 
-def scroll_to(name: str) -> None:
-    """Scroll to the element with this name (see `tag`)."""
-    ui.run_javascript(f"document.querySelector('[data-test=\"{name}\"]')?.scrollIntoView()")
-
-
 def text(message: str, kind: str = "p", classes: str = "") -> ui.html:
     """Add plain text as an HTML element."""
     return html(message, kind).classes(classes)
@@ -401,7 +396,7 @@ class WorkPanel:
         self._closed: set[str] = set()
         self._state: tuple[Any, ...] | None = None
         self._bars: dict[str, tuple[ui.linear_progress, ui.label]] = {}
-        self._box = tag(ui.column().classes("ps-work w-full"), "work")
+        self._box = page.work = tag(ui.column().classes("ps-work w-full"), "work")
         # Parent element for timers, because the box is cleared.
         self._after = ui.element("div").classes("hidden")
         on_change(self._jobs.changed, self.refresh)
@@ -419,6 +414,7 @@ class WorkPanel:
         assert job is not None
         self._watched.add(job.id)
         self.refresh()
+        self._page.show_work()
         return job
 
     def refresh(self) -> None:

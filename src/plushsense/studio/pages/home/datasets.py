@@ -86,6 +86,7 @@ class DatasetSection:
         with self._page.show_errors():
             title = self._page.words("Checking “{name}”", name=entry.name)
             self._jobs.start("check", {"dataset": str(entry.path), "name": entry.name}, title)
+            self._page.show_work()
 
     def _backup(self, entry: DatasetEntry) -> None:
         """Start to write a backup, named after the data set and the day."""
@@ -95,6 +96,7 @@ class DatasetSection:
             place = workspace.folder / BACKUPS / f"{workspace.free_name(BACKUPS, stem, '.zip', separator=' ')}.zip"
             spec = {"dataset": str(entry.path), "place": str(place), "name": entry.name}
             self._jobs.start("backup", spec, self._page.words("Backup of “{name}”", name=entry.name))
+            self._page.show_work()
 
     def _show_backups(self, backups: Sequence[Path]) -> None:
         words = self._page.words
@@ -119,6 +121,7 @@ class DatasetSection:
             name = workspace.free_name(DATASETS, path.stem, separator=" ")
             spec = {"file": str(path), "dest": str(workspace.new(DATASETS, name)), "name": name}
             self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))
+            self._page.show_work()
 
     async def _discard(self, path: Path) -> None:
         workspace = self._page.workspace
@@ -217,6 +220,7 @@ class ForgetDialog:
             spec = {"dataset": str(self._entry.path), "person": self._person, "name": self._entry.name}
             with self._page.show_errors():
                 self._jobs.start("forget", spec, words("Removing a person from “{name}”", name=self._entry.name))
+                self._page.show_work()
 
         with self._box:
             person = self._person

@@ -249,6 +249,7 @@ class SessionSection:
             return
         self._page.say("")
         self._jobs.import_sessions(chosen, place, self._page.words("Import into the data set “{name}”", name=name))
+        self._page.show_work()
 
 
 class JobList:
@@ -258,7 +259,8 @@ class JobList:
         self._page, self._jobs = page, jobs
         self._displayed: tuple[Any, ...] | None = None
         self._progress_bars: dict[str, tuple[ui.label, ui.linear_progress]] = {}
-        with titled_card(page, "Jobs", "work"):
+        page.work = titled_card(page, "Jobs", "work")
+        with page.work:
             self._rows = ui.column().classes("w-full ps-small-gap")
         self.update()
 

@@ -13,12 +13,12 @@ from nicegui import ui
 
 from plushsense.experiments.protocol.run_protocol import PAGE, TABLE, TRIALS
 from plushsense.experiments.protocol.score import NAMELESS
-from plushsense.studio.app.shell import Page, button, html, moment, on_change, section, tag
+from plushsense.studio.app.shell import Page, button, html, moment, on_change, reveal, section, tag
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.live.adapting import PersonFields
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.validation import FOLDER, Validation
-from plushsense.studio.widgets.elements import notice, picture, scroll_to, summary, table
+from plushsense.studio.widgets.elements import notice, picture, summary, table
 
 _HEADS: Texts = {
     "rules_answered": "Rules: answered",
@@ -137,7 +137,7 @@ class _ValidationPanel:
             await asyncio.to_thread(
                 self._validation.begin, subject, int(self._repetitions.value), tune_on, self._noted.value
             )
-            scroll_to("validation")
+            reveal(self._prompts)
 
     def _update_button(self) -> None:
         self._begin.set_enabled(self._reader.now.running)

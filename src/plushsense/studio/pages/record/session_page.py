@@ -294,8 +294,8 @@ class _View:
         if text:
             self._session.recorder.note(text)
             self._note.value = ""
-        # Leave the note field, so that the space bar is a command again.
-        ui.run_javascript("document.activeElement?.blur()")
+        # Leave the note field, so that the space bar starts and stops again.
+        focus(self._main)
 
     def _ask_end(self) -> None:
         words = self._page.words

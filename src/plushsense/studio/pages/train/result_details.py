@@ -19,6 +19,7 @@ from plushsense.studio.app.shell import (
     heading,
     html,
     icon_button,
+    reveal,
     scroll_region,
     tag,
 )
@@ -62,7 +63,7 @@ class ResultDetailsView:
         """Display the details of a result."""
         self._details = await run.io_bound(self._results.details, row)
         self._draw()
-        ui.run_javascript("setTimeout(() => document.querySelector('[data-test=details]')?.scrollIntoView(), 60)")
+        reveal(self._place)
 
     def _close(self) -> None:
         self._details = None

@@ -132,7 +132,6 @@ class ResultsSection:
             _refocus(f"sort:{which}")
         elif action == "open":
             await self.open(which)
-            _refocus(str(event.args))
         elif action == "all":
             self._all = True
             self._draw()

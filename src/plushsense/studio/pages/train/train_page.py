@@ -40,7 +40,7 @@ from plushsense.studio.pages.train.stored_results import (
     score_labels,
 )
 from plushsense.studio.pages.train.verdict import FEW_PEOPLE
-from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, scroll_to
+from plushsense.studio.widgets.elements import KINDS_OF_TRAINING
 from plushsense.training.spec import DEVICES, PRESETS
 from plushsense.windows.cut import ANYWHERE, CONTEXTS, TRAIN_CONTEXTS
 
@@ -150,11 +150,13 @@ _NUMBERS = (
 class TrainingForm:
     """Form for a new job: one button for the usual one, and all others with their settings folded away.
 
-    It keeps entered values when another kind of job is chosen.
+    It keeps entered values when another kind of job is chosen. ``begun`` is called with the id of a job that it has
+    started.
     """
 
-    def __init__(self, page: Page, jobs: Jobs, results: StoredResults) -> None:
+    def __init__(self, page: Page, jobs: Jobs, results: StoredResults, begun: Callable[[str], None]) -> None:
         self._page, self._jobs, self._results, self._words = page, jobs, results, page.words
+        self._begun = begun
         self._datasets = {str(path): page.workspace.title(path) for path in page.workspace.datasets()}
         self._kind = TRAIN
         self._values: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
@@ -418,10 +420,7 @@ class TrainingForm:
             self._begin(job_request(self._page.workspace, self._jobs, form))
 
     def _begin(self, request: JobRequest) -> None:
-        self._jobs.start(request.task, request.spec, request.title)
-        begun = self._words("The work has begun: its progress is under “Jobs” below. You may close this page.")
-        self._page.say(begun, "good")
-        scroll_to("job")
+        self._begun(self._jobs.start(request.task, request.spec, request.title).id)
 
     def _estimate(self) -> None:
         self._page.say("")
@@ -559,7 +558,7 @@ async def show(page: Page) -> None:
     )
     ui.label(about).classes("ps-dim")
     rows = await run.io_bound(results.rows)
-    form = TrainingForm(page, jobs, results)
+    form = TrainingForm(page, jobs, results, lambda identity: job_list.open(identity))
     job_list = JobsSection(page, jobs, results, lambda identity: table.open(identity))
     table = ResultsSection(page, results, rows or [])
     context.client.on_delete(form.close)
