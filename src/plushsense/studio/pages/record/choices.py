@@ -12,7 +12,7 @@ from plushsense.core.gestures import load_gestures
 from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import ORDERS
 from plushsense.studio.app.shell import Page, button, named, tag
-from plushsense.studio.app.toys import toy_title
+from plushsense.studio.app.toys import found_title, toy_title
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.controller import RecordController
 from plushsense.studio.widgets.elements import summary
@@ -78,7 +78,7 @@ class ToyChoice:
         if listing is None:
             return
         options = {u: toy_title(words, u) for u in dict.fromkeys(self._urls)}
-        options |= {d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in options}
+        options |= {d.url: found_title(words, d) for d in listing.devices if d.url not in options}
         self._list.set_options(options, value=self._list.value)
         notes = [words.sentence(note) for note in listing.notes]
         self._page.say(" ".join([words("Toys to choose from: {n}.", n=len(options)), *notes]))

@@ -163,6 +163,8 @@ class StepList:
             if len(steps) > _MAX_STEPS:
                 ui.label(words("There are too many recordings to list. Press b to go back and s to skip."))
                 return
+            signs = {**{key: words(text) for key, text in _STEPS.items()}, "now": words("now")}
+            ui.label(" · ".join(f"{_SIGNS[key]} {text}" for key, text in signs.items())).classes("ps-dim")
             rows: dict[str, list[int]] = {}
             for result in steps:
                 rows.setdefault(result.step.gesture, []).append(result.step.number)

@@ -194,8 +194,8 @@ class RecordingView:
         self._drawn = now
         self.heading.set_text(row.id)
         recorded = recorded_as(words, row)
-        gesture = f"{AFFECT_SIGNS[row.affect]} {words.gesture(row.info.gesture)}"
-        self.affect.set_text(f"{gesture} ({recorded})" if recorded else gesture)
+        gesture = words.gesture(row.info.gesture) + (f" ({recorded})" if recorded else "")
+        self.affect.set_text(f"{AFFECT_SIGNS[row.affect]} {gesture}, {words.affect(row.affect)}")
         self.affect.style(f"background: {AFFECT_COLOURS.get(row.affect, '#767676')}")
         self.state.set_text(f"{SIGNS[row.state]} {words(STATE_TEXTS[row.state])}")
         self.state.props(f'data-state="{row.state}"')
