@@ -316,6 +316,10 @@ class Plot(Element, component="plot.js"):
         """Replace all curves and, if given, the series; None in a curve is a gap."""
         self.run_method("show", [list(x), *map(list, curves)], series)
 
+    def enlarge(self, on: bool) -> None:
+        """Scale a live plot by what it shows, instead of the range of all samples so far."""
+        self.run_method("enlarge", on)
+
     def push(self, x: Sequence[float], curves: Sequence[Sequence[float]]) -> None:
         """Append samples at the right end of a live plot, and drop those that leave its window."""
         self.run_method("push", list(x), [list(c) for c in curves])

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from nicegui import ui
+from nicegui.events import ValueChangeEventArguments
 
 from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import LINES, Page, button, named, on_click, tag
@@ -64,6 +65,7 @@ class SignalPanel:
             with tag(ui.element("details").props("open").classes("w-full"), "live"):
                 summary(words("Sensor signals"))
                 self._plots = self._build(max(1.0, session.request.speed))
+                tag(ui.switch(words("Enlarge small changes"), on_change=self._enlarge), "enlarge")
         rate = self._device.layout.rate_hz * max(1.0, session.request.speed)
         self._place = max(0, self._device.buffer.count - int(_WINDOW_S * rate))
         self._drawn_signal = ""
@@ -96,6 +98,10 @@ class SignalPanel:
                     )
                     plots.append((tag(plot, f"plot-{kind}"), indices))
         return plots
+
+    def _enlarge(self, event: ValueChangeEventArguments) -> None:
+        for plot, _ in self._plots:
+            plot.enlarge(bool(event.value))
 
     def draw(self, s: RecorderStatus) -> None:
         """Display the current signal quality."""
