@@ -15,6 +15,7 @@ export default {
     await this.$nextTick();
     const at = window.path_prefix + this.resourcePath;
     await Promise.all([loadResource(`${at}/uPlot.min.css`), loadResource(`${at}/uPlot.iife.min.js`)]);
+    this.$el.psPlot = this;
     this.curves = this.series;
     this.kept = this.start || [[], ...this.series.map(() => [])];
     this.build();
