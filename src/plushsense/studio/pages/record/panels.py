@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 from nicegui import ui
-from nicegui.events import ValueChangeEventArguments
 
 from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import LINES, Page, button, named, on_click, tag
@@ -99,7 +98,7 @@ class SignalPanel:
                     plots.append((tag(plot, f"plot-{kind}"), indices))
         return plots
 
-    def _enlarge(self, event: ValueChangeEventArguments) -> None:
+    def _enlarge(self, event: Any) -> None:
         for plot, _ in self._plots:
             plot.enlarge(bool(event.value))
 

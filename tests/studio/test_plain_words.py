@@ -1,0 +1,62 @@
+"""What the pages call things, and what a toy at rest looks like, as somebody who does not program reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from support.browsing import LONG_MS, axe, connected, marked
+from support.recording_pages import begun
+
+Fixture = Callable[..., Any]
+_SPREAD = """name => {
+  const u = document.querySelector(`[data-test="${name}"]`).psPlot.u, { min, max } = u.scales.y;
+  return Math.max(...u.data.slice(1).map((y) => Math.max(...y) - Math.min(...y))) / (max - min) }"""
+"""What share of a plot's height its highest curve takes."""
+
+
+def test_a_session_is_named_in_plain_words_and_rests_quietly(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    server, browser = studio("--device", "virtual://?person=7&lost=0&garbled=0&glitch=0", "--speed", "4"), look()
+    page = browser.open(server.url)
+    marked(page, "chosen").get_by_text("Chosen: Virtual toy (simulation), person 7").wait_for()
+    page.goto(server.url + "/record?new=1")
+    connected(page)
+    assert marked(page, "toy").input_value() == "Virtual toy (simulation), person 7"
+    begun(page, server.url, "S01")
+    texts = page.locator("body").inner_text()
+    assert "extremities" in texts and "cap_" not in texts and "acc_" not in texts
+    marked(page, "steps").locator("summary").click()
+    assert "✓ recorded · – skipped · ○ not recorded yet · ▶ now" in marked(page, "steps").inner_text()
+    # The proximity sensor at rest: a flat line, unless small changes are enlarged.
+    marked(page, "plot-proximity").locator(".u-marker").wait_for()
+    page.wait_for_function(f"() => ({_SPREAD})('plot-proximity') < 0.35")
+    marked(page, "enlarge").click()
+    page.wait_for_function(f"() => ({_SPREAD})('plot-proximity') > 0.8")
+    markers = page.locator(".u-marker").evaluate_all("all => all.map(m => m.getBoundingClientRect().height)")
+    assert markers and max(markers) < 6, "the legend is no row of check boxes"
+    assert axe(page) == []
+    assert browser.complaints == []
+
+
+def test_a_review_is_named_in_plain_words_and_rest_is_flat(studio: Fixture, look: Fixture, home: Path) -> None:
+    server, browser = studio(home=home), look()
+    at = f"{server.url}/review?dataset={home / 'datasets' / 'virtual'}"
+    page = browser.open(at)
+    assert marked(page, "who").input_value() not in ("root", "administrator")
+    table = page.locator("caption").first.inner_text()
+    assert table == "Recordings (+ positive, ○ neutral, − negative, · none)"
+    marked(page, "making").get_by_text("Checking").wait_for(state="detached", timeout=LONG_MS)
+    marked(page, "accept-sure").click()
+    message = marked(page, "message")
+    message.get_by_text("Starts accepted: ").wait_for()
+    assert "Still to decide: " in message.inner_text() and "Choose “One by one”" in message.inner_text()
+    page.goto(f"{at}&gesture=At%20rest&view=one")
+    connected(page)
+    marked(page, "plot").locator("canvas").wait_for()
+    page.wait_for_function(f"() => ({_SPREAD})('plot') < 0.06")
+    assert "At rest, neutral" in marked(page, "one").inner_text()
+    marked(page, "enlarge").click()
+    page.wait_for_function(f"() => ({_SPREAD})('plot') > 0.15")
+    assert axe(page) == []
+    assert browser.complaints == []
