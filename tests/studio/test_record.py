@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from plushsense.dataset.store import DatasetHead
 from plushsense.recording.session import is_finished
 from plushsense.recording.writer import SessionHead
 from support.browsing import PHONE, TABLET, ZOOM, axe, connected, marked
@@ -300,6 +301,42 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     marked(page, "main").click()
     showing(page, "idle.2.2.0.0")
     assert len(files(tmp_path / "home")) == 2
+    assert browser.complaints == []
+
+
+def test_a_gesture_of_ones_own_keeps_its_affect(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    server, browser = studio(*SPEED), look(PHONE)
+    page = browser.open(server.url + "/record?new=1")
+    own = marked(page, "own-protocol")
+    own.locator("summary").click()
+    for chosen in (18, 0):
+        marked(page, "own-all").click()
+        page.wait_for_function(
+            "n => document.querySelectorAll('.ps-card [role=checkbox][aria-checked=true][data-test^=own-]').length === n",
+            arg=chosen,
+        )
+    for name, refused in (("a/b", "cannot be a name"), ("tail_pull", "in the list already")):
+        marked(page, "own-gesture").fill(name)
+        marked(page, "own-add").click()
+        own.get_by_role("alert").get_by_text(refused).wait_for()
+    assert axe(page) == []
+    marked(page, "own-gesture").fill("Angry poke")
+    choose(page, "own-affect", "negative")
+    marked(page, "own-add").click()
+    marked(page, "own-Angry poke").wait_for()
+    marked(page, "own-name").fill("mine")
+    marked(page, "own-repetitions").fill("1")
+    marked(page, "own-save").click()
+    marked(page, "discard-protocol").wait_for()
+    marked(page, "code").fill("S01")
+    marked(page, "begin").click()
+    sat(page, "S01/1")
+    assert marked(page, "prompt").inner_text() == "Angry poke"
+    take(page, 0)
+    marked(page, "collect").click()
+    page.wait_for_url("**/review?dataset=**")
+    (head,) = (tmp_path / "home" / "datasets").glob("*/dataset.toml")
+    assert DatasetHead.read(head.parent).gestures.get("angry poke").affect == "negative"
     assert browser.complaints == []
 
 
