@@ -6,6 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.live.event_log import log_csv
+from plushsense.studio.pages.live.live_state import EventSpan
 from support.browsing import LONG_MS, axe, connected, marked
 from support.recording_pages import begun
 
@@ -14,6 +17,47 @@ _SPREAD = """name => {
   const u = document.querySelector(`[data-test="${name}"]`).psPlot.u, { min, max } = u.scales.y;
   return Math.max(...u.data.slice(1).map((y) => Math.max(...y) - Math.min(...y))) / (max - min) }"""
 """What share of a plot's height its highest curve takes."""
+
+_TWICE = """() => {
+  const seen = [], names = (all, name) => [...document.querySelectorAll(all)]
+    .filter((e) => e.checkVisibility() && name(e)).forEach((e) => seen.push(name(e).trim()));
+  names('h1, h2, h3, [role=heading]', (e) => e.innerText);
+  names('[role=combobox], input:not([type=file])', (e) => e.getAttribute('aria-label') || e.closest('label')?.innerText);
+  return seen.filter((name, n) => seen.indexOf(name) !== n) }"""
+"""Names of headings and fields that a page has twice."""
+
+
+def test_the_log_of_a_session_opens_in_a_latvian_spreadsheet() -> None:
+    named = EventSpan(1, 1, 1, 2.5, "positive", "Tail tap 1", "cnn", 4.0, 0.75)
+    events = (named, EventSpan(2, 2, 2, 9.0, "none", None, "gate"))
+    head, first, second = log_csv(Words("lv"), events).splitlines()
+    assert head.startswith("\ufefftime;toy_s;lasted_s;")
+    assert first.split(";")[1:7] == ["2,50", "1,50", "Tail tap 1", "positive", "0,750", "tīkls"]
+    assert second.split(";")[2:7] == ["", "", "none", "", "noteikumi"]
+    assert ",2.50,1.50,Tail tap 1,positive,0.750,network," in log_csv(Words("en"), events)
+
+
+def test_no_heading_or_field_has_the_name_of_another(studio: Fixture, look: Fixture, home: Path) -> None:
+    server, browser = studio(home=home), look()
+    page = browser.open(server.url)
+    for path in ("/", "/record?new=1", "/review", "/train", "/live", "/export", "/publish"):
+        page.goto(server.url + path)
+        connected(page)
+        assert page.evaluate(_TWICE) == [], path
+    page.goto(server.url + "/train")
+    connected(page)
+    assert page.get_by_role("region", name="Results", exact=True).count() == 1
+    # Two trainings at once on two cores take twice as long: a question first.
+    marked(page, "make").click()
+    marked(page, "stop").wait_for()
+    marked(page, "make").click()
+    marked(page, "ask").get_by_text("two jobs at once").wait_for()
+    assert axe(page) == []
+    page.get_by_role("button", name="Cancel").click()
+    marked(page, "stop").click()
+    page.locator("[data-state=stopped]").wait_for(timeout=LONG_MS)
+    assert page.locator("[data-job]").count() == 1
+    assert browser.complaints == []
 
 
 def test_a_session_is_named_in_plain_words_and_rests_quietly(studio: Fixture, look: Fixture, tmp_path: Path) -> None:

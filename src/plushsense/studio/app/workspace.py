@@ -244,7 +244,9 @@ class Workspace:
         """Return ``name`` without outer spaces; raise ConfigError if it is not a plain file name."""
         plain = name.strip()
         dotted = plain.startswith(".") or plain.endswith(".")
-        if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain) or DEVICE_NAME.match(plain):
+        if DEVICE_NAME.match(plain):
+            raise ConfigError("“{name}” is reserved by Windows. Give another name.", name=plain, field="name")
+        if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain):
             raise ConfigError(
                 "“{name}” cannot be a name. Use at most 64 letters, digits, spaces, points and hyphens.",
                 name=name,

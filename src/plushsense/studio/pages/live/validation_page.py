@@ -80,7 +80,7 @@ class _ValidationPanel:
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         self._form = ui.row().classes("w-full items-start ps-small-gap")
         with self._form:
-            self._person = people.add("validation-person").classes("w-64")
+            self._person = people.add("validation-person", words("Live validation with a new person")).classes("w-64")
             times = {n: words("{n} times", n=n) if n > 1 else words("once") for n in (3, 2, 1)}
             self._repetitions = ui.select(times, value=3, label=words("Each gesture")).classes("w-36")
             tag(self._repetitions, "validation-times")

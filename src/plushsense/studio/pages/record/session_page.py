@@ -442,6 +442,8 @@ class _View:
         self._number.set_visibility(bool(number))
         if self._message.text != (message := words.sentence(s.message)):
             self._message.text = message
+            look = "ps-message ps-message-warning"
+            self._message.classes(**{"add" if s.message.template.startswith("Nobody stopped") else "remove": look})
         self._alert.prepare(self._lost_text(s))
         self._box.style(f"background: {colour}")
         self._box.props(f'data-state="{state}"')

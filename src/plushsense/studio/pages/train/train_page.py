@@ -41,7 +41,7 @@ from plushsense.studio.pages.train.stored_results import (
     score_labels,
 )
 from plushsense.studio.pages.train.verdict import FEW_PEOPLE
-from plushsense.studio.widgets.elements import KINDS_OF_TRAINING
+from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, ask
 from plushsense.training.spec import DEVICES, PRESETS
 from plushsense.windows.cut import ANYWHERE, CONTEXTS, TRAIN_CONTEXTS
 
@@ -422,7 +422,18 @@ class TrainingForm:
             self._begin(job_request(self._page.workspace, self._jobs, form))
 
     def _begin(self, request: JobRequest) -> None:
-        self._begun(self._jobs.start(request.task, request.spec, request.title).id)
+        """Start a job, but ask first while another one trains: two at once take longer each."""
+        jobs, w = self._jobs, self._words
+
+        def start(_: str = "") -> None:
+            self._begun(jobs.start(request.task, request.spec, request.title).id)
+
+        running = [job for job in jobs.all(MAKE, *KINDS) if job.state == RUNNING and not job.spec.get("dry")]
+        if not running:
+            start()
+            return
+        text = "“{title}” is still being worked on, and two jobs at once take about twice as long each."
+        ask(w, w(text, title=running[0].title), w("Start both"), start)
 
     def _estimate(self) -> None:
         self._page.say("")
