@@ -19,11 +19,13 @@ _SPREAD = """name => {
 """What share of a plot's height its highest curve takes."""
 
 _TWICE = """() => {
-  const seen = [], names = (all, name) => [...document.querySelectorAll(all)]
-    .filter((e) => e.checkVisibility() && name(e)).forEach((e) => seen.push(name(e).trim()));
-  names('h1, h2, h3, [role=heading]', (e) => e.innerText);
-  names('[role=combobox], input:not([type=file])', (e) => e.getAttribute('aria-label') || e.closest('label')?.innerText);
-  return seen.filter((name, n) => seen.indexOf(name) !== n) }"""
+  const twice = (all, name) => {
+    const names = [...document.querySelectorAll(all)].filter((e) => e.checkVisibility()).map(name).filter(Boolean);
+    return names.filter((each, n) => names.indexOf(each) !== n);
+  };
+  const label = (e) => e.getAttribute('aria-label') || e.closest('label')?.innerText.trim();
+  return [...twice('h1, h2, h3, [role=heading]', (e) => e.innerText.trim()),
+    ...twice('[role=combobox], input:not([type=file])', label)] }"""
 """Names of headings and fields that a page has twice."""
 
 

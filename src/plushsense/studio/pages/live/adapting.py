@@ -161,11 +161,10 @@ class _AdaptingPanel:
         self._adapting = page.workspace.part(Adapting)
         self._busy = False
         words = page.words
-        ui.label(words("Adapt the network to a person")).classes("text-bold")
+        title = words("Adapt the network to a person")
+        ui.label(title).classes("text-bold")
         with ui.row().classes("w-full items-center ps-small-gap"):
-            self._person = people.add("adapt-person", words("Adapt the network to a person"), self._update).style(
-                "flex: 1 1 9rem"
-            )
+            self._person = people.add("adapt-person", title, self._update).style("flex: 1 1 9rem")
             self._recordings = tag(ui.select({}, label=words("Recordings of the person")), "adapt-from")
             self._recordings.style("flex: 1 1 15rem; min-width: 0")
             self._adapt = button("adapt", words("Adapt to these recordings"), self._run, icon="auto_fix_high")
