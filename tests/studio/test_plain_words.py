@@ -52,7 +52,8 @@ def test_no_heading_or_field_has_the_name_of_another(studio: Fixture, look: Fixt
     # Two trainings at once on two cores take twice as long: a question first.
     marked(page, "make").click()
     marked(page, "stop").wait_for()
-    marked(page, "make").click()
+    marked(page, "more").click()
+    marked(page, "start").click()
     marked(page, "ask").get_by_text("two jobs at once").wait_for()
     assert axe(page) == []
     page.get_by_role("button", name="Cancel").click()
