@@ -173,7 +173,7 @@ class Workspace:
                 raise ConfigError(
                     "“{name}” exists already. Give another name; nothing is replaced.", name=name, field="name"
                 )
-            self._check_name(name)
+            self.check_name(name)
             change_head(real, lambda head: replace(head, name=name))
             return real
         place = self.new(BUNDLES, f"{name}{real.suffix}")
@@ -239,7 +239,7 @@ class Workspace:
         Raises:
             ConfigError: if ``name`` is not a plain file name, or exists already.
         """
-        plain = self._check_name(name)
+        plain = self.check_name(name)
         place = self.inside(Path(kind) / plain)
         if place.exists():
             raise ConfigError(
@@ -248,10 +248,13 @@ class Workspace:
         return place
 
     @staticmethod
-    def _check_name(name: str) -> str:
+    def check_name(name: str) -> str:
+        """Return ``name`` without outer spaces; raise ConfigError if it is not a plain file name."""
         plain = name.strip()
         dotted = plain.startswith(".") or plain.endswith(".")
-        if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain) or DEVICE_NAME.match(plain):
+        if DEVICE_NAME.match(plain):
+            raise ConfigError("“{name}” is reserved by Windows. Give another name.", name=plain, field="name")
+        if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain):
             raise ConfigError(
                 "“{name}” cannot be a name. Use at most 64 letters, digits, spaces, points and hyphens.",
                 name=name,

@@ -134,6 +134,7 @@ class ForgetDialog:
             spec = {"home": str(home), "given": [str(p) for p in self._given], "name": home.name, "person": person}
             title = self._words("Forgetting a person everywhere")
             self._jobs.start("forget", spec | {"chosen": [trace.id for trace in chosen]}, title)
+            self._page.show_work()
 
 
 def receipt_text(page: Page, receipt: dict[str, Any], ended_s: float) -> str:

@@ -37,7 +37,7 @@ _NEXT: Texts = {
     "record": "A toy is chosen: record the first person.",
     "go_on": "Session {session} of {subject} is not finished.",
     "recording": "Session {session} of {subject} is being recorded.",
-    "making": "A data set is being made. See its progress under Jobs.",
+    "making": "A data set is being made.",
     "collect": "Some sessions are not in a data set yet: {n} (recordings: {recordings}).",
     "review": "Review the recordings of “{name}” before you train a network on them.",
     "more": "“{name}” holds one person only. Record more people, so that the network also works for new people.",
@@ -54,6 +54,7 @@ _NEXT_BUTTONS: Texts = {
     "record": "Record",
     "go_on": "Continue recording",
     "recording": "Show the recording",
+    "making": "Show the progress",
     "collect": "Put them into a data set",
     "review": "Review",
     "more": "Record",
@@ -217,6 +218,8 @@ class NextStepCard:
             self._try()
         elif step.key == "collect":
             self._collect()
+        elif step.key == "making":
+            self._page.show_work()
         else:
             self._go(step.page, step)
 
@@ -233,6 +236,7 @@ class NextStepCard:
             place = workspace.dataset_for(batch[0].layout, batch[0].simulated, name)
             title = self._page.words("Import into the data set “{name}”", name=workspace.title(place))
             self._jobs.import_sessions([s.path for s in batch if s.waiting], place, title)
+            self._page.show_work()
 
     def _try(self) -> None:
         """Start to simulate a small data set, and choose the virtual toy if no toy is chosen."""
@@ -248,3 +252,4 @@ class NextStepCard:
                 "work": str(workspace.folder / WORK),
             }
             self._jobs.start("simulate", spec, self._page.words("Trial: a data set of virtual people"))
+            self._page.show_work()

@@ -257,7 +257,12 @@ class SessionSection:
             return
         self._page.say("")
         title = self._page.words("Import into the data set “{name}”", name=name)
-        await admitting(self._page, lambda readmit: self._jobs.import_sessions(chosen, place, title, readmit))
+
+        def start(readmit: bool) -> None:
+            self._jobs.import_sessions(chosen, place, title, readmit)
+            self._page.show_work()
+
+        await admitting(self._page, start)
 
 
 class JobList:
@@ -267,7 +272,8 @@ class JobList:
         self._page, self._jobs = page, jobs
         self._displayed: tuple[Any, ...] | None = None
         self._progress_bars: dict[str, tuple[ui.label, ui.linear_progress]] = {}
-        with titled_card(page, "Jobs", "work"):
+        page.work = titled_card(page, "Jobs", "work")
+        with page.work:
             self._rows = ui.column().classes("w-full ps-small-gap")
         self.update()
 

@@ -14,10 +14,10 @@ from plushsense.core.errors import AddressError, ConfigError, DeviceError, Layou
 from plushsense.recording.plan import DEFAULT, load_protocol, wordings
 from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary, check_subject
 from plushsense.studio.app.choices import Choices
-from plushsense.studio.app.shell import Page, address, button, html, named, on_page, query, tag
+from plushsense.studio.app.shell import CHILD, Page, address, button, html, named, on_page, query, tag
 from plushsense.studio.app.toys import ToyInUseError, toy_title
 from plushsense.studio.app.words import Texts
-from plushsense.studio.pages.record.child import CHILD, show_child
+from plushsense.studio.pages.record.child import show_child
 from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session_page import collect, show_session

@@ -15,10 +15,10 @@ from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import SessionHead
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
-from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.shell import CHILD, Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.toys import ToyInUseError
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.record.child import CHILD, ConnectionAlert, gesture_picture, style
+from plushsense.studio.pages.record.child import ConnectionAlert, gesture_picture, style
 from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.last_recording import ResultPanel
@@ -236,16 +236,15 @@ class _View:
                 self._small[key] = button(name, text).style("min-height: 48px")
                 on_click(self._small[key], partial(self._press, key))
             self._change_toy = button("change-toy", words("Another toy"), self._ask_toy, "flat")
-            # The space bar must not start a recording where it seems to press this button.
-            self._end_button = button("end", words("End the session"), self._ask_end, "flat data-own-keys")
+            self._end_button = button("end", words("End the session"), self._ask_end, "flat")
             for late in (self._change_toy, self._end_button):
                 late.style("min-height: 48px")
-        ending = ui.row().classes("ps-message ps-message-warning w-full items-center").props("data-own-keys")
+        ending = ui.row().classes("ps-message ps-message-warning w-full items-center")
         with tag(ending, "ending") as self._ending:
             self._end_text = ui.label().classes("flex-grow")
             button("end-yes", words("End it"), lambda: self._end(), "unelevated", color="deep-orange-10")
             self._no = button("end-no", words("Stay"), self._stay, color=None)
-        exchange = ui.row().classes("ps-card w-full items-start").props("data-own-keys")
+        exchange = ui.row().classes("ps-card w-full items-start")
         with tag(exchange, "exchange") as self._exchange:
             about = words(
                 "The session goes on with another toy of the same sensor layout. It is tried first. Everything "
@@ -305,7 +304,7 @@ class _View:
         if text:
             self._session.recorder.note(text)
             self._note.value = ""
-        # Leave the note field, so that the space bar is a command again.
+        # Leave the note field, so that the space bar starts and stops again.
         focus(self._main)
 
     def _ask_end(self) -> None:
@@ -452,6 +451,8 @@ class _View:
         self._number.set_visibility(bool(number))
         if self._message.text != (message := words.sentence(s.message)):
             self._message.text = message
+            look = "ps-message ps-message-warning"
+            self._message.classes(**{"add" if s.message.template.startswith("Nobody stopped") else "remove": look})
         self._alert.prepare(self._lost_text(s))
         self._box.style(f"background: {colour}")
         self._box.props(f'data-state="{state}"')

@@ -51,7 +51,7 @@ _FILTERS: Texts = {
 }
 
 _DID: Texts = {
-    "trim": "trim",
+    "trim": "setting start and end",
     "untrim": "removing the trim",
     "exclude": "excluding",
     "include": "including again",
@@ -62,6 +62,14 @@ _DID: Texts = {
     "relabel": "setting another gesture",
 }
 
+_DONE: Texts = {
+    "trim": "Starts accepted: {n}.",
+    "exclude": "Excluded: {n}.",
+    "include": "Included again: {n}.",
+    "relabel": "Set to another gesture: {n}.",
+}
+"""What was done to several recordings; the keys are kinds of marks."""
+
 _MAKING: Texts = {
     "suggestions": "Looking for starts: {done} of {of}. You can begin already.",
     "checks": "Checking: {done} of {of} files.",
@@ -70,6 +78,8 @@ _MAKING: Texts = {
 TABLE, ONE, OVERLAY, DURATIONS, STREAM = "table", "one", "overlay", "durations", "stream"
 VIEWS = (TABLE, ONE, OVERLAY, DURATIONS, STREAM)
 WHO_COOKIE = "plushsense_who"
+# Logins that are no person's.
+_ACCOUNTS = ("root", "administrator", "admin", "user")
 _AHEAD = 4
 _LOOK_S = 1.5
 
@@ -318,8 +328,9 @@ class ReviewController:
         request = context.client.request
         name = unquote(request.cookies.get(WHO_COOKIE, "")) if request is not None else ""
         with contextlib.suppress(PlushSenseError):
-            return name or author_name(None)
-        return ""
+            login = author_name(None)
+            return name or ("" if login.lower() in _ACCOUNTS else login)
+        return name
 
     def _keep_who(self, name: str | None) -> None:
         cookie = json.dumps(f"{WHO_COOKIE}={quote(name or '')}; path=/; max-age=31536000; SameSite=Strict")
@@ -463,8 +474,10 @@ class ReviewController:
         async with self._turn:
             with self.page.show_errors():
                 changed = await run.io_bound(decision)
-                what = self.words(_DID[action])
-                text = self.words("Done: {what}. Recordings changed: {n}.", what=what, n=changed or 0)
+                text = self.words(_DONE[action], n=changed or 0)
+                if action == "trim" and (left := sum(not row.done for row in self.review.rows.values())):
+                    rest = "Still to decide: {n}. Choose “{one}” and go through them: Enter accepts, x excludes."
+                    text = f"{text} {self.words(rest, n=left, one=self.words(_VIEWS[ONE]))}"
                 self.page.say(text, "good" if changed else "info", self.undo if changed else None)
                 return True
         return False
