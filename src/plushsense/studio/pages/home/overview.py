@@ -18,6 +18,7 @@ from plushsense.core.recorder_csv import parse_name
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.build import RECORDER
 from plushsense.dataset.marks import MARKS
+from plushsense.dataset.privacy.removed import may_be_suggested
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
 from plushsense.models.bundle import Bundle
 from plushsense.recording.session import is_finished
@@ -55,7 +56,7 @@ class SessionEntry:
     """Summary of a recorded session.
 
     ``datasets`` are the names of the data sets that contain all its recordings; ``active`` is whether it is being
-    recorded now.
+    recorded now; ``removed`` whether the person was removed from the workspace, so that it is not suggested.
     """
 
     path: Path
@@ -69,11 +70,12 @@ class SessionEntry:
     refused: str = ""
     datasets: tuple[str, ...] = ()
     active: bool = False
+    removed: bool = False
 
     @property
     def waiting(self) -> bool:
-        """True if the session has ended, has recordings, and no data set contains all of them."""
-        return bool(self.recordings) and not (self.datasets or self.refused or self.active)
+        """True if the session has ended, has recordings of a person to suggest, and no data set contains them all."""
+        return bool(self.recordings) and not (self.datasets or self.refused or self.active or self.removed)
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ def next_step(summary: WorkspaceSummary, *, toy: str = "", virtual: bool = False
     if waiting:
         return NextStep("collect", "", {"n": len(waiting), "recordings": sum(s.recordings for s in waiting)})
     if not readable and not bundles:
-        unfinished = [s for s in summary.sessions if not s.finished and not s.refused]
+        unfinished = [s for s in summary.sessions if not (s.finished or s.refused or s.removed)]
         if unfinished:
             return NextStep("go_on", "record", {"subject": unfinished[-1].subject, "session": unfinished[-1].session})
         return NextStep("record", "record") if toy and not virtual else NextStep("try")
@@ -173,7 +175,11 @@ class Overview:
             datasets = tuple(self._cached(p, _dataset, HEAD, INDEX, MARKS) for p in self._workspace.datasets())
             active = {use.name for use in self._workspace.part(Toys).in_use}
             read = (_session(path, datasets) for path in self._workspace.sessions())
-            sessions = tuple(replace(s, active=f"{s.subject}/{s.session}" in active) for s in read)
+            home = self._workspace.folder
+            sessions = tuple(
+                replace(s, active=f"{s.subject}/{s.session}" in active, removed=not may_be_suggested(home, s.subject))
+                for s in read
+            )
             bundles = tuple(self._cached(p, _bundle, "") for p in self._workspace.bundles())
         exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
         backups = tuple(sorted((self._workspace.folder / BACKUPS).glob("*.zip")))

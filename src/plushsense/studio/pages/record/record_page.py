@@ -83,10 +83,10 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
 def _ended(page: Page, session: SessionSummary) -> None:
     """Add the button that leads from an ended session to its recordings."""
 
-    def clicked() -> None:
+    async def clicked() -> None:
         see.disable()
         with page.show_errors():
-            collect(page, session.folder)
+            see.set_enabled(not await collect(page, session.folder))
 
     with tag(ui.row().classes("ps-card ps-next w-full items-center"), "ended-session"):
         text = page.words("Recordings of this session: {n}. They are put into a data set.", n=session.done)
