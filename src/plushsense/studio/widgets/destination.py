@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -69,12 +70,18 @@ class Destination:
                 workspace.part(Choices).keep(**{self._key: str(place), "dataset": str(place)})
                 page.say(words("The recordings go into the data set “{name}” …", name=name))
 
+                ended = False
+
                 def follow() -> None:
+                    nonlocal ended
+                    if ended or job.state == RUNNING:
+                        return
+                    ended = True
                     if job.state == DONE:
                         then(place)
-                    elif job.state != RUNNING:
-                        stopped = words("The recordings were not put into a data set: try it again on the home page.")
-                        page.say(words.failure(job.refusal) or stopped, "error")
+                        return
+                    stopped = words("The recordings were not put into a data set: try it again on the home page.")
+                    page.say(words.failure(job.refusal) or stopped, "error")
 
                 on_change(jobs.changed, follow)
 
@@ -92,7 +99,8 @@ async def take_back(page: Page, dataset: Path, sessions: Sequence[str], then: Ca
     with page.show_errors():
         page.workspace.part(Jobs).check_unused(dataset)
         await run.io_bound(_take_back, page.workspace, dataset, sessions)
-        then()
+        if inspect.isawaitable(done := then()):
+            await done
 
 
 def _take_back(workspace: Workspace, dataset: Path, sessions: Sequence[str]) -> None:
