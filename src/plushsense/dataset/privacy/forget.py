@@ -369,6 +369,9 @@ def take_out(dataset: str | Path, session: Path) -> None:
             # The index first, which would say that files are lost.
             for path in (*(folder / name for name in reversed(INDEX)), *places, folder / CACHE):
                 _remove(path)
+            for place in places:
+                with contextlib.suppress(OSError):  # not empty: the person has other sessions there
+                    place.parent.rmdir()
             _rewrite_marks(folder, name)
             people = read_people(folder)
             if session.parent.name not in person_folders(folder):

@@ -14,7 +14,7 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import take_out
 from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
-from plushsense.studio.app.shell import Page, address, on_change, tag
+from plushsense.studio.app.shell import Page, address, named, on_change, tag
 from plushsense.studio.app.workspace import DATASETS, Workspace
 from plushsense.studio.widgets.elements import admitting, errors_beside
 
@@ -34,10 +34,11 @@ def moved(sessions: Sequence[str], dataset: str) -> str:
 class Destination:
     """Fields for the data set that sessions of one layout go into: one that exists, or a new one.
 
-    The last choice is preselected; real sessions and those of a virtual toy have one each.
+    The last choice is preselected; real sessions and those of a virtual toy have one each. Screen readers read
+    ``about``, which tells these fields from others of the page.
     """
 
-    def __init__(self, page: Page, layout: str, simulated: bool) -> None:
+    def __init__(self, page: Page, layout: str, simulated: bool, about: str = "") -> None:
         self._page, workspace, words = page, page.workspace, page.words
         self._key = f"sessions of {layout}{', simulated' if simulated else ''}"
         fitting = {str(path): workspace.title(path) for path in workspace.fitting(layout, simulated)}
@@ -47,6 +48,9 @@ class Destination:
             self._list = ui.select(options, value=last, label=words("Into the data set")).classes("ps-wide")
             free = workspace.free_name(DATASETS, words("recordings"))
             self._name = ui.input(words("Name of the new data set"), value=free).classes("ps-wide")
+        if about:
+            for field in (self._list, self._name):
+                named(field, f"{about}: {field.props['label']}")
         tag(self._list, "destination").set_visibility(bool(fitting))
         tag(self._name, "new-name").bind_visibility_from(self._list, "value", value="")
 

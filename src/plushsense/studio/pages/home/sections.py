@@ -226,7 +226,7 @@ class SessionSection:
                     box = ui.checkbox(self._describe(entry), value=str(entry.path) in self._chosen)
                     box.on_value_change(lambda e, entry=entry: self._choose(entry, bool(e.value)))
                     box.set_enabled(not entry.active)
-            destination = Destination(page, batch[0].layout, batch[0].simulated)
+            destination = Destination(page, batch[0].layout, batch[0].simulated, words("Recorded sessions"))
             button("make", words("Put them into a data set"), partial(self._put, batch, destination), "unelevated")
 
     def _describe(self, entry: SessionEntry) -> str:
