@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -26,14 +27,19 @@ DATASETS = "datasets"
 _ROUNDS = 20_000
 
 
+def comparable(code: str) -> str:
+    """Return a code without case, punctuation and leading zeros, so that ``S01``, ``s-1`` and ``S1`` are equal."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", normalize_code(code))
+
+
 @lru_cache(4096)
 def _hash(salt: str, code: str) -> str:
-    return hashlib.pbkdf2_hmac("sha256", normalize_code(code).encode(), bytes.fromhex(salt), _ROUNDS).hex()
+    return hashlib.pbkdf2_hmac("sha256", comparable(code).encode(), bytes.fromhex(salt), _ROUNDS).hex()
 
 
 @dataclass(frozen=True)
 class RemovedCodes:
-    """The codes that were removed from a home; ``code in removed`` ignores case and punctuation."""
+    """The codes that were removed from a home; ``code in removed`` ignores case, punctuation and leading zeros."""
 
     salt: str = field(default_factory=lambda: secrets.token_hex(16), repr=False)
     hashes: tuple[str, ...] = ()

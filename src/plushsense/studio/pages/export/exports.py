@@ -8,7 +8,7 @@ from pathlib import Path
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Message
-from plushsense.dataset.publishing.tables import list_package_files
+from plushsense.dataset.files import list_package_files
 from plushsense.deploy.code import FACTS, ModelFacts, read_facts
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.quantize import integer_model
