@@ -9,7 +9,7 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -62,8 +62,6 @@ class Workspace:
         toy: URL of the chosen toy, "" for none.
         speed: speed of a virtual toy, as a multiple of real time.
         invite: returns an address with a new token for one more visitor; None if no token is needed.
-        recording: names of the sessions that are being recorded, as ``<subject>/<session>``; see `set_recording`.
-        recording_changed: notified when ``recording`` changes.
     """
 
     folder: Path
@@ -73,8 +71,6 @@ class Workspace:
     toy: str = ""
     speed: float = 1.0
     invite: Callable[[], str] | None = None
-    recording: tuple[str, ...] = ()
-    recording_changed: ChangeSignal = field(default_factory=lambda: ChangeSignal(), repr=False)
     _parts: dict[type, Any] = field(default_factory=dict, repr=False)
     _titles: dict[Path, tuple[FileStamps, str]] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
@@ -103,12 +99,6 @@ class Workspace:
         for part in reversed(parts):
             if hasattr(part, "close"):
                 part.close()
-
-    def set_recording(self, names: Iterable[str]) -> None:
-        """Set the names of the sessions that are being recorded; every page shows them."""
-        if self.recording != (now := tuple(names)):
-            self.recording = now
-            self.recording_changed.notify()
 
     # Contents -------------------------------------------------------------------------------------------------
 

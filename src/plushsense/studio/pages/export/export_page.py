@@ -478,7 +478,7 @@ class _Exporting:
             split=scores.get("split", "?"),
         )
         leaky = f" {words('(leaky: windows of the same recordings were trained on)')}" if scores.get("leaky") else ""
-        simulated = f" {words('(of virtual people: no result)')}" if origin.get("simulated") else ""
+        simulated = f" {words('(of virtual people: no result)')}" if bundle.simulated else ""
         return [*rows, (words("Scores"), f"{value}{leaky}{simulated}")]
 
     def _allow(self) -> None:

@@ -67,7 +67,7 @@ class BundleFacts:
     @property
     def simulated(self) -> bool:
         """True if the bundle was trained on simulated data."""
-        return self.bundle is not None and bool(self.bundle.provenance.get("simulated", False))
+        return self.bundle is not None and self.bundle.simulated
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from plushsense.dataset.marks import MARKS, RECORDER
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
 from plushsense.recording.session import is_finished
 from plushsense.recording.writer import SessionHead
+from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import BACKUPS, EXPORTS, Workspace, file_stamps
 
 INDEX = "recordings.csv"
@@ -168,7 +169,7 @@ class Overview:
         """Return the current contents of the workspace."""
         with self._lock:
             datasets = tuple(self._cached(p, _dataset, HEAD, INDEX, MARKS) for p in self._workspace.datasets())
-            active = self._workspace.recording
+            active = {use.name for use in self._workspace.part(Toys).in_use}
             read = (_session(path, datasets) for path in self._workspace.sessions())
             sessions = tuple(replace(s, active=f"{s.subject}/{s.session}" in active) for s in read)
             bundles = tuple(self._cached(p, _bundle, "") for p in self._workspace.bundles())
@@ -261,6 +262,4 @@ def _bundle(path: Path) -> BundleEntry:
     except (PlushSenseError, OSError) as cause:
         return BundleEntry(path, path.stem, refused=_refusal(path, cause))
     origin = bundle.provenance
-    return BundleEntry(
-        path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bool(origin.get("simulated"))
-    )
+    return BundleEntry(path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bundle.simulated)

@@ -318,7 +318,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             split,
             str(context),
             bool(scores.get("leaky")),
-            bool(origin.get("simulated")),
+            bundle.simulated,
             str(training.get("seed", "?")),
             # Unless whole people were held back, the network was trained on the people it was scored on.
             *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
