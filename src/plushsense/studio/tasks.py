@@ -7,6 +7,7 @@ standard output: ``{"progress": {...}}``, ``{"warning": ...}``, and finally ``{"
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
@@ -37,9 +38,10 @@ from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
-from plushsense.studio.app.jobs import UNFINISHED
+from plushsense.studio.app.jobs import READY, UNFINISHED
 from plushsense.studio.app.workspace import folder_digest, refusal_of
 from plushsense.training.spec import EpochRow
+from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
@@ -302,6 +304,22 @@ def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     return {"bundle": str(bundle)}
 
 
+def _try(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Wait until ``session`` is complete, and train a network for trying on it, in the folder ``place``."""
+    importlib.import_module("plushsense.training.fit")
+    place = Path(spec["place"])
+    while not (place / READY).exists():
+        time.sleep(0.05)
+    import_recordings(Path(spec["session"]).parents[1], place / "trial")
+    config = from_settings(context=ANYWHERE, epochs=_TRIAL_EPOCHS)
+
+    def epoch(at: int, of: int, row: EpochRow) -> None:
+        reporter.progress(share=at / of)
+
+    done = train(place / "trial", config, fit_decisions=False, progress=epoch, warn=reporter.warn)
+    return {"bundle": str(done.save(place / "only for trying.plush")), "seconds": done.seconds}
+
+
 def _make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Train a network and evaluate it on people left out, in about ``minutes``; see `make_network`."""
     out = Path(spec["out"])
@@ -415,6 +433,8 @@ def _export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 _SAMPLES = 100_000
+# A few seconds on two cores.
+_TRIAL_EPOCHS = 40
 
 
 def _verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -441,6 +461,7 @@ def _verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "check": _check,
+    "trial": _try,
     "make": _make,
     "train": _train,
     "sweep": _sweep,

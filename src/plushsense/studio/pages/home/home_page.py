@@ -199,6 +199,8 @@ class NextStepCard:
                 tag(ui.label(words(_NEXT[step.key], **step.values)), "next-sentence").classes("text-lg")
                 if text := _NEXT_BUTTONS.get(step.key):
                     button("next-button", words(text), lambda: self._do(step), "unelevated size=lg color=primary")
+                trial = words("Try it with three gestures of your own")
+                button("try-three", trial, lambda: ui.navigate.to(address("live", trial="1")))
                 if second := {"try": "record", "live": "export"}.get(step.key):
                     button("", words(_NEXT_BUTTONS[second]), lambda: ui.navigate.to(address(second)))
 
