@@ -48,6 +48,7 @@ from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dat
 from plushsense.workflow.export import export
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people, refits
+from plushsense.workflow.project import open_project, save_project
 from plushsense.workflow.reporting import check_folder
 
 
@@ -235,6 +236,19 @@ def _restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits)
     write_file(dataset.path / HEAD, replace(dataset.head, name=spec["name"]).to_toml())
     return {"dataset": str(spec["dest"]), "recordings": len(dataset.recordings), "people": len(dataset.subjects)}
+
+
+def _save(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Write the ``datasets`` and ``networks`` into the new project ``place``."""
+    paths = (list(map(Path, spec[kind])) for kind in ("datasets", "networks"))
+    return asdict(save_project(spec["place"], *paths, progress=reporter.count))
+
+
+def _open(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Open the project ``file`` in the studio's folder ``home``."""
+    done = open_project(spec["file"], spec["home"], reporter.count)
+    rejected = [{"file": name, "reason": why} for name, why in done.refused]
+    return {"datasets": done.datasets, "networks": done.networks, "rejected": rejected}
 
 
 def _forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -477,6 +491,8 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "validate": _validate,
     "backup": _backup,
     "restore": _restore,
+    "save": _save,
+    "open": _open,
     "forget": _forget,
 }
 """Functions of the tasks by name. Specs and results contain only JSON values."""

@@ -53,6 +53,8 @@ _TITLES = {
     "check": "Checking “{name}”",
     "backup": "Backup of “{name}”",
     "restore": "Restoring “{name}”",
+    "save": "Saving “{name}”",
+    "open": "Opening “{name}”",
     "forget": "Removing a person from “{name}”",
     "export": "Export “{name}”",
     "profile": "Cost of “{name}”",

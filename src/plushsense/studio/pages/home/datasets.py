@@ -112,8 +112,14 @@ class DatasetSection:
 
     def _restore(self, path: Path) -> None:
         """Start to restore a backup as a new data set; the present one is not changed."""
+        from plushsense.workflow.project import is_project
+
         workspace = self._page.workspace
         with self._page.show_errors():
+            if is_project(path):
+                spec = {"file": str(path), "home": str(workspace.folder), "name": path.stem}
+                self._jobs.start("open", spec, self._page.words("Opening “{name}”", name=path.stem))
+                return
             name = workspace.free_name(DATASETS, path.stem, separator=" ")
             spec = {"file": str(path), "dest": str(workspace.new(DATASETS, name)), "name": name}
             self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))

@@ -40,7 +40,7 @@ _LOOK_S = 0.1
 _CHOOSING, _RECORDING, _LEARNING, _LIVE = "choosing", "recording", "learning", "live"
 
 
-class Trial:
+class FirstTrial:
     """Service for one trial at a time; every change notifies `changed`.
 
     All its files are in a temporary folder, which is removed when the trial or the studio ends. Its methods block.
@@ -196,7 +196,7 @@ def _remove(folder: Path, job: StudioJob | None) -> None:
 
 def show(page: Page, person_panel: Callable[[Page, LiveReader], None]) -> None:
     """Build the page of a trial; ``person_panel`` adds the buttons that direct the person of a virtual toy."""
-    trial, reader = page.workspace.part(Trial), page.workspace.part(LiveReader)
+    trial, reader = page.workspace.part(FirstTrial), page.workspace.part(LiveReader)
     _TrialSection(page, trial)
     live = ui.column().classes("w-full no-wrap")
     feed: Feed | None = None
@@ -220,7 +220,7 @@ def show(page: Page, person_panel: Callable[[Page, LiveReader], None]) -> None:
 class _TrialSection:
     """Section that leads through a trial: what to do, the recording, the training, and what becomes of it."""
 
-    def __init__(self, page: Page, trial: Trial) -> None:
+    def __init__(self, page: Page, trial: FirstTrial) -> None:
         self._page, self._words, self._trial = page, page.words, trial
         self._state = ""
         with named(ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"), self._words(TITLE)):
