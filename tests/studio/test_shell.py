@@ -21,11 +21,11 @@ from plushsense.deploy.code import FACTS
 from plushsense.recording.writer import SESSION_HEAD, SESSION_LOG
 from plushsense.studio.app import shell
 from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES, TOUR, page_texts
+from plushsense.studio.app.stored_results import Confusion
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review.controller import VIEWS
 from plushsense.studio.pages.train.result_details import confusion_table
-from plushsense.studio.pages.train.stored_results import Confusion
 from plushsense.studio.widgets.elements import link, picture, verdict
 from plushsense.workflow.api import simulate
 from plushsense.workflow.reporting import SCORES

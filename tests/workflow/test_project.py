@@ -10,8 +10,9 @@ import pytest
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.index import open_dataset
+from plushsense.dataset.privacy.removed import remember_removed
 from plushsense.workflow.api import simulate
-from plushsense.workflow.project import MANIFEST, is_project, open_project, save_project
+from plushsense.workflow.project import MANIFEST, is_project, open_project, project_people, save_project
 from support.bundles import odd_bundle
 
 
@@ -28,6 +29,7 @@ def test_a_project_holds_data_and_networks_and_replaces_nothing(tmp_path: Path) 
     with pytest.raises(DatasetError, match="no data set and no network"):
         save_project(tmp_path / "empty.zip", [], [])
     assert is_project(saved) and not is_project(network)
+    assert project_people(saved) == ["P01"] and project_people(network) == []
 
     # Twice: data sets get a number, the same network is not doubled.
     for names in (("virtual",), ("virtual 2",)):
@@ -38,6 +40,9 @@ def test_a_project_holds_data_and_networks_and_replaces_nothing(tmp_path: Path) 
     assert {d.hash for d in there} == {open_dataset(dataset).hash}
     assert len({d.head.name for d in there}) == 2
     assert sorted(p.name for p in other.iterdir()) == ["bundles", "datasets"]
+    # A person who was removed there does not come back by it.
+    remember_removed(other, "P01")
+    assert [name for name, _ in open_project(saved, other).refused] == ["virtual.zip"]
 
 
 def test_a_hostile_project_is_refused_part_by_part(tmp_path: Path) -> None:

@@ -15,15 +15,17 @@ from pathlib import Path
 from plushsense.core.errors import BundleError, DatasetError, PlushSenseError
 from plushsense.core.files import free_path, replacing_file, work_folder, write_file
 from plushsense.core.sentences import Message
-from plushsense.dataset.backup import backup, restore
+from plushsense.dataset.backup import backup, backup_people, restore
 from plushsense.dataset.files import list_package_files
 from plushsense.dataset.importing.archives import DAMAGED, UnpackLimits, unpack, zip_entry
+from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.dataset.store import HEAD, DatasetHead, Progress
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, known_people
 
 MANIFEST = "plushsense-project.json"
 DATASETS, BUNDLES = "datasets", "bundles"
 VERSION = 1
+_MANIFEST_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,22 @@ def is_project(file: str | Path) -> bool:
     try:
         with zipfile.ZipFile(file) as archive:
             return MANIFEST in archive.namelist()
-    except (*DAMAGED, OSError):
+    except DAMAGED:
         return False
+    except OSError:
+        return False
+
+
+def project_people(file: str | Path) -> list[str]:
+    """Return the people in the data sets of a project, and those whom its networks know, by its manifest."""
+    try:
+        with zipfile.ZipFile(file) as archive, archive.open(MANIFEST) as member:
+            people = json.loads(member.read(_MANIFEST_BYTES))["people"]
+            return [str(code) for code in people]
+    except DAMAGED:
+        return []
+    except (OSError, KeyError, TypeError, RecursionError):
+        return []
 
 
 def save_project(
@@ -65,15 +81,17 @@ def save_project(
     with work_folder(target) as work, replacing_file(target, within=work) as part:
         for kind in (DATASETS, BUNDLES):
             (work / kind).mkdir()
+        people: set[str] = set()
         for done, source in enumerate((*datasets, *networks)):
             progress(done, parts)
             if done < len(datasets):
-                backup(source, _unused(work / DATASETS / f"{source.name}.zip"))
+                stored = backup(source, _unused(work / DATASETS / f"{source.name}.zip"))
+                people |= set(backup_people(stored.file))
             else:
-                Bundle.load(source)
+                people |= known_people(Bundle.load(source).provenance)
                 write_file(_unused(work / BUNDLES / source.name), source.read_bytes())
         with zipfile.ZipFile(part, "w") as archive:
-            archive.writestr(zip_entry(MANIFEST), json.dumps({"version": VERSION}) + "\n")
+            archive.writestr(zip_entry(MANIFEST), json.dumps({"version": VERSION, "people": sorted(people)}) + "\n")
             for path in _members(work):
                 entry = zip_entry(path.relative_to(work).as_posix())
                 entry.compress_type = zipfile.ZIP_STORED
@@ -151,7 +169,7 @@ def _restore(part: Path, datasets: Path, limits: UnpackLimits | None) -> str:
 def _add(part: Path, bundles: Path) -> str:
     if part.suffix != ".plush":
         raise BundleError("'{path}' is no network.", path=part)
-    Bundle.load(part)
+    refuse_removed(bundles, known_people(Bundle.load(part).provenance))
     place = free_path(bundles / part.name, content := part.read_bytes())
     if not place.exists():
         bundles.mkdir(parents=True, exist_ok=True)

@@ -400,13 +400,13 @@ def query() -> dict[str, str]:
     return dict(request.query_params) if request is not None else {}
 
 
-def query_path(workspace: Workspace, key: str, allowed: Iterable[str]) -> str:
-    """Return the path in the query parameter ``key`` if it is allowed, else the last choice, or the first, or ""."""
+def query_path(workspace: Workspace, key: str, allowed: Iterable[str], default: str | None = None) -> str:
+    """Return the path in the query parameter ``key`` if allowed, else the last choice, ``default`` or the first."""
     paths = list(allowed)
     with suppress(PlushSenseError):
         if (path := str(workspace.inside(query().get(key, "")))) in paths:
             return path
-    return workspace.part(Choices).last(key, paths)
+    return workspace.part(Choices).last(key, paths, default)
 
 
 def set_address(path: str) -> None:

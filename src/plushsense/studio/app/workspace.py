@@ -16,8 +16,10 @@ from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.sentences import Message
-from plushsense.dataset.files import change_head, list_package_files, sha256_of
+from plushsense.dataset.files import change_head, list_package_files, person_folders, sha256_of
 from plushsense.dataset.importing.archives import DEVICE_NAME
+from plushsense.dataset.privacy.codes import HomeCodes
+from plushsense.dataset.privacy.removed import RemovedCodes
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.writer import SESSION_HEAD
 
@@ -128,6 +130,14 @@ class Workspace:
     def sessions(self) -> list[Path]:
         """Return the folders of all sessions in `recordings`, sorted by subject and name."""
         return sorted(p.parent for p in self.recordings.glob(f"*/*/{SESSION_HEAD}"))
+
+    def codes(self, apart_from: str = "") -> HomeCodes:
+        """Return the codes of all people, also in discarded sessions, but for ``apart_from``."""
+        recorded = sorted((p for p in self.recordings.glob("*/")), key=lambda p: p.stat().st_mtime)
+        others = {p.name for p in (self.folder / DISCARDED / RECORDINGS).glob("*/")}
+        others |= {code for dataset in self.datasets() for code in person_folders(dataset)}
+        names = tuple(p.name for p in recorded if p.name != apart_from)
+        return HomeCodes(names, frozenset(others - {apart_from}), RemovedCodes.read(self.folder))
 
     def roots(self) -> Iterator[Path]:
         """Yield the folders that pages may access."""

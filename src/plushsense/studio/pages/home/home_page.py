@@ -30,7 +30,10 @@ from plushsense.studio.pages.home.toy import ToySection
 from plushsense.studio.widgets.elements import style
 
 _NEXT: Texts = {
-    "try": "There is nothing here yet. Try everything with a virtual toy: it takes a minute and needs no hardware.",
+    "try": (
+        "There is nothing here yet. Try everything with a virtual toy, without hardware: recordings take a minute, a "
+        "network at most ten."
+    ),
     "record": "A toy is chosen: record the first person.",
     "go_on": "Session {session} of {subject} is not finished.",
     "recording": "Session {session} of {subject} is being recorded.",
@@ -39,6 +42,10 @@ _NEXT: Texts = {
     "review": "Review the recordings of “{name}” before you train a network on them.",
     "more": "“{name}” holds one person only. Record more people, so that the network also works for new people.",
     "train": "“{name}” is ready: train a network on it.",
+    "improve": (
+        "The network “{name}” is not usable yet, because it may be guessing. Record two more people, or each gesture "
+        "two more times, then train again."
+    ),
     "live": "The network “{name}” is trained. Watch it live, or export it for the toy.",
 }
 
@@ -51,6 +58,7 @@ _NEXT_BUTTONS: Texts = {
     "review": "Review",
     "more": "Record",
     "train": "Train",
+    "improve": "Record",
     "live": "Watch it live",
     "export": "Export",
 }
@@ -81,6 +89,9 @@ def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], No
                     if entry.dataset:
                         facts.append(page.words("trained on “{name}”", name=entry.dataset))
                     ui.label(" · ".join(facts)).classes("ps-dim")
+                    from plushsense.studio.widgets.verdict import show_verdict
+
+                    show_verdict(page.words, entry.score)
                     with ui.row().classes("ps-small-gap"):
                         page_links(page, ("live", "export"), entry.name, model=entry.path)
 
@@ -233,7 +244,7 @@ class NextStepCard:
                 trial = words("Try it with three gestures of your own")
                 button("try-three", trial, lambda: ui.navigate.to(address("live", trial="1")))
                 if second := {"try": "record", "live": "export"}.get(step.key):
-                    button("", words(_NEXT_BUTTONS[second]), lambda: ui.navigate.to(address(second)))
+                    button("", words(_NEXT_BUTTONS[second]), lambda: self._go(second, step))
 
     def _do(self, step: NextStep) -> None:
         if step.key == "try":
@@ -241,7 +252,11 @@ class NextStepCard:
         elif step.key == "collect":
             self._collect()
         else:
-            ui.navigate.to(address(step.page))
+            self._go(step.page, step)
+
+    @staticmethod
+    def _go(page: str, step: NextStep) -> None:
+        ui.navigate.to(address(page, model=step.values.get("model", "")))
 
     def _collect(self) -> None:
         """Import the sessions that are in no data set; add them to one that fits, if there is one."""

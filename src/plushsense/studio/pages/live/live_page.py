@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from nicegui import context, ui
+from nicegui import context, run, ui
 
 from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
 from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
+from plushsense.studio.app.stored_results import ResultRow, StoredResults, recommended
 from plushsense.studio.app.toys import ToyInUseError, Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL
@@ -25,6 +26,7 @@ from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
 from plushsense.studio.widgets.elements import notice, style, summary
+from plushsense.studio.widgets.verdict import show_choice
 
 _REACTIONS: Texts = {
     "standard": "green, or red if rough",
@@ -34,8 +36,9 @@ _REACTIONS: Texts = {
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
 
 
-def show(page: Page) -> None:
+async def show(page: Page) -> None:
     """Build the page."""
+    networks = await run.io_bound(page.workspace.part(StoredResults).networks) or {}
     reader = page.workspace.part(LiveReader)
     words = page.words
     style()
@@ -44,7 +47,7 @@ def show(page: Page) -> None:
         return
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
-        _Controls(page, reader, feed)
+        _Controls(page, reader, feed, networks)
     mark = tag(notice(""), "simulation")
 
     def update_mark() -> None:
@@ -105,8 +108,8 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
 class _Controls:
     """Fields for toy, network and settings, which are folded while a toy is read, and the buttons above them."""
 
-    def __init__(self, page: Page, reader: LiveReader, feed: Feed) -> None:
-        self._page, self._reader, self._feed = page, reader, feed
+    def __init__(self, page: Page, reader: LiveReader, feed: Feed, networks: Mapping[Path, ResultRow]) -> None:
+        self._page, self._reader, self._feed, self._networks = page, reader, feed, networks
         self._workspace, self._toys = page.workspace, page.workspace.part(Toys)
         words, choice = page.words, reader.choice
         self._state: tuple[Any, ...] = ()
@@ -123,8 +126,11 @@ class _Controls:
                 self._bundles = {str(path): path.stem for path in self._workspace.bundles()}
                 chosen = str(choice.bundle) if choice.bundle else None
                 if chosen is None or (query().get("model") and not reader.now.running):
-                    chosen = query_path(self._workspace, "model", self._bundles) or None
-                self._bundle = tag(ui.select(self._bundles, value=chosen, label=words("Network")), "bundle")
+                    chosen = query_path(self._workspace, "model", self._bundles, recommended(networks)) or None
+                with ui.column().classes("ps-no-gap"):
+                    box = ui.select(self._bundles, value=chosen, label=words("Network"))
+                    self._bundle = tag(box.classes("w-full"), "bundle")
+                    self._score = ui.column().classes("ps-no-gap ps-note")
                 names = {"": words(in_context("reactions", "none"))}
                 names |= {name: words(_REACTIONS.get(name, name)) for name in reaction_names()}
                 self._reactions = ui.select(names, value=choice.reactions, label=words("Reactions of the toy"))
@@ -139,12 +145,19 @@ class _Controls:
                 virtual = ui.checkbox(words("This is a virtual toy: a simulation"), value=choice.simulated)
                 self._simulated = tag(virtual, "simulated")
         self._toy.on_value_change(self._update_simulated)
+        self._bundle.on_value_change(self._show_score)
+        self._show_score()
         for control in (self._bundle, self._engine, self._reactions):
             control.on_value_change(self._change)
         on_change(reader.changed, self._update)
         on_change(self._toys.changed, self._update_toys)
         self._update_simulated()
         self._update()
+
+    def _show_score(self) -> None:
+        self._score.clear()
+        with self._score:
+            show_choice(self._page.words, self._networks, self._bundle.value)
 
     def _add_toy(self, label: str) -> None:
         reader, workspace = self._reader, self._workspace

@@ -16,6 +16,7 @@ from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.sentences import Message
 from plushsense.core.version import __version__
+from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.devices.opening import is_virtual, speed_of, with_speed
 from plushsense.recording.recorder import AutoRecording, Recorder, open_toy, prompt_virtual
 from plushsense.recording.session import OpenSession, SessionRequest, change_subject, session_folder, session_head
@@ -153,6 +154,7 @@ class FirstTrial:
             if self.state != _LIVE or folder is None or self.kept:
                 raise ConfigError("There are no recordings to keep.")
             (session,) = (folder / "recordings").glob("*/*")
+            refuse_removed(self._workspace.recordings, [code])
             place = change_subject(session, code, self._workspace.recordings)
             self.kept = f"{place.parent.name}/{place.name}"
         self.changed.notify()
