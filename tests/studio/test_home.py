@@ -10,6 +10,7 @@ import pytest
 
 from plushsense.studio.app.workspace import DATASETS, Workspace
 from support.browsing import DESK, LONG_MS, TABLET, axe, marked
+from support.bundles import odd_bundle
 from support.recorded import record
 
 pytestmark = pytest.mark.early
@@ -204,3 +205,27 @@ def test_everything_is_within_reach_of_the_keyboard(what: str, studio: Fixture, 
     else:
         for name in ("Watch it live", "Review: virtual toy", "Check: virtual toy", "Use the virtual toy"):
             assert name in reached, reached
+
+
+def test_everything_is_saved_in_one_file_and_opened_where_nothing_is_replaced(
+    studio: Fixture, look: Fixture, few: Path, tmp_path: Path
+) -> None:
+    (few / "bundles").mkdir(exist_ok=True)
+    odd_bundle(few / "bundles" / "net.plush")
+    here = studio(home=few)
+    page = look().open(here.url)
+    marked(page, "save-everything").click()
+    saved = marked(page, "job-done").filter(has_text="Saving")
+    saved.get_by_text("data sets: 1 · networks: 1").wait_for(timeout=LONG_MS)
+    with page.expect_download() as download:
+        saved.locator('[data-test="download"]').click()
+    file = tmp_path / "project.zip"
+    download.value.save_as(file)
+    # In the same studio: a second data set, and the same network once.
+    with page.expect_file_chooser() as chooser:
+        marked(page, "open-everything").click()
+    chooser.value.set_files(file)
+    marked(page, "job-done").filter(has_text="Opening").get_by_text("data sets: 1 · networks: 1").wait_for()
+    page.wait_for_function("() => document.querySelectorAll('[data-test=dataset]').length === 2")
+    assert sorted(p.name for p in (few / "datasets").iterdir() if p.is_dir()) == ["virtual", "virtual 2"]
+    assert [p.name for p in (few / "bundles").iterdir()] == ["net.plush"]

@@ -284,17 +284,17 @@ def mark_finished(folder: Path, finished: bool = True) -> None:
         session.log.write([new_event("finished", early=True) if finished else new_event("reopened")])
 
 
-def change_subject(folder: Path, code: str) -> Path:
-    """Give the session in ``folder`` to the person ``code``, and return its new folder.
+def change_subject(folder: Path, code: str, recordings: Path | None = None) -> Path:
+    """Give the session in ``folder`` to the person ``code``, and return its new folder, in ``recordings`` if given.
 
     It keeps its name, or gets a number if the person has a session of that name.
 
     Raises:
         DatasetError: for an invalid code, or if another program uses the session.
     """
-    if code == folder.parent.name:
+    person = (recordings or folder.parent.parent) / check_subject(code)
+    if person == folder.parent:
         return folder
-    person = folder.parent.parent / check_subject(code)
     OpenSession(folder).close()  # refuses if another program uses it
     place = person / (folder.name if not (person / folder.name).exists() else new_session(person))
     person.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ standard output: ``{"progress": {...}}``, ``{"warning": ...}``, and finally ``{"
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
@@ -36,9 +37,10 @@ from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
-from plushsense.studio.app.jobs import UNFINISHED
+from plushsense.studio.app.jobs import READY, UNFINISHED
 from plushsense.studio.app.workspace import folder_digest, refusal_of
 from plushsense.training.spec import EpochRow
+from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings, from_stored
 from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
@@ -46,6 +48,7 @@ from plushsense.workflow.export import export
 from plushsense.workflow.forgetting import forget_everywhere
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people, refits
+from plushsense.workflow.project import open_project, save_project
 from plushsense.workflow.reporting import check_folder, load_evaluation
 
 
@@ -240,6 +243,19 @@ def _restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     return {"dataset": str(spec["dest"]), "recordings": len(dataset.recordings), "people": len(dataset.subjects)}
 
 
+def _save(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Write the ``datasets`` and ``networks`` into the new project ``place``."""
+    datasets, networks = (list(map(Path, spec[kind])) for kind in ("datasets", "networks"))
+    return asdict(save_project(spec["place"], datasets, networks, reporter.count))
+
+
+def _open(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Open the project ``file`` in the studio's folder ``home``."""
+    done = open_project(spec["file"], spec["home"], reporter.count)
+    rejected = [{"file": name, "reason": why} for name, why in done.refused]
+    return {"datasets": done.datasets, "networks": done.networks, "rejected": rejected}
+
+
 def _forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Remove what is ``chosen`` of the traces of ``person`` in ``home`` and in the data sets ``given``.
 
@@ -313,6 +329,22 @@ def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     bundle = done.save(free_path(out, done.bundle.to_bytes()))
     exported = _export({"bundle": str(bundle), "place": spec["place"]}, reporter) if spec.get("place") else {}
     return {"bundle": str(bundle), **exported}
+
+
+def _try(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Wait until ``session`` is complete, and train a network for trying on it, in the folder ``place``."""
+    importlib.import_module("plushsense.training.fit")
+    place = Path(spec["place"])
+    while not (place / READY).exists():
+        time.sleep(0.05)
+    import_recordings(Path(spec["session"]).parents[1], place / "trial")
+    config = from_settings(context=ANYWHERE, epochs=_TRIAL_EPOCHS)
+
+    def epoch(at: int, of: int, row: EpochRow) -> None:
+        reporter.progress(share=at / of)
+
+    done = train(place / "trial", config, fit_decisions=False, progress=epoch, warn=reporter.warn)
+    return {"bundle": str(done.save(place / "only for trying.plush")), "seconds": done.seconds}
 
 
 def _make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -428,6 +460,8 @@ def _export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 _SAMPLES = 100_000
+# A few seconds on two cores.
+_TRIAL_EPOCHS = 40
 
 
 def _verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -454,6 +488,7 @@ def _verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "check": _check,
+    "trial": _try,
     "make": _make,
     "train": _train,
     "sweep": _sweep,
@@ -469,6 +504,8 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "validate": _validate,
     "backup": _backup,
     "restore": _restore,
+    "save": _save,
+    "open": _open,
     "forget": _forget,
 }
 """Functions of the tasks by name. Specs and results contain only JSON values."""

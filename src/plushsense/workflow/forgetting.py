@@ -30,6 +30,7 @@ from plushsense.deploy.code import FACTS, read_facts
 from plushsense.models.bundle import Bundle, is_training_content, known_people
 from plushsense.recording.session import LOCK
 from plushsense.recording.writer import SESSION_HEAD
+from plushsense.workflow.project import project_people
 
 SUFFIX = ".plush"
 
@@ -289,7 +290,7 @@ def people_of_home(home: Path, given: Iterable[Path] = ()) -> list[str]:
             people |= _people_of_bundle(Bundle.load(path))
     for path in files.archives:
         with suppress(DatasetError):
-            people |= set(backup_people(path))
+            people |= set(_people_in(path))
     return sorted(people - {NOBODY, UNKNOWN_SUBJECT})
 
 
@@ -373,10 +374,15 @@ def _traces_of_models(files: _HomeFiles, person: str, known: Iterable[PersonTrac
     return traces
 
 
+def _people_in(archive: Path) -> list[str]:
+    """Return the people in a backup or a project."""
+    return backup_people(archive) if is_backup(archive) else project_people(archive)
+
+
 def _traces_of_archives(files: _HomeFiles, codes: tuple[str, ...]) -> Iterator[PersonTrace]:
     """Yield the packages and backups that hold a person; ``codes`` are the person's own one, then those in packages."""
     for path in files.archives:
-        held = [c for c in backup_people(path) if _is_of(c, codes[0])] if is_backup(path) else []
+        held = [c for c in _people_in(path) if _is_of(c, codes[0])]
         if held:
             yield PersonTrace("backup", path, codes[0], (path,), certain=codes[0] in held)
     packed = [path for path in files.archives if not is_backup(path) and CHECKSUMS in _members(path)]

@@ -25,6 +25,8 @@ UNFINISHED = ".unfinished-"
 """Prefix of temporary folders in the work folder; leftovers are removed when the studio starts."""
 INCOMING = "incoming"
 """Folder in the work folder for uploaded files that are not imported yet; it is removed when the studio starts."""
+READY = "ready"
+"""File beside the session of a trial, by which its training, which was started before, knows that it is complete."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _MAX_REPORTS = 2000
 # Keys of a spec or result that are never stored, because they identify people.
@@ -70,7 +72,7 @@ class StudioJob:
 class Jobs:
     """The jobs of a studio, stored in ``<workspace>/work/<id>.json``; every report notifies `changed`.
 
-    A job with ``dry`` set in its spec is an estimate: it is removed when it ends.
+    A job with ``dry`` set in its spec is an estimate or of a trial: it is removed when it ends.
     """
 
     def __init__(self, workspace: Workspace) -> None:

@@ -55,6 +55,8 @@ _TITLES = {
     "check": "Checking “{name}”",
     "backup": "Backup of “{name}”",
     "restore": "Restoring “{name}”",
+    "save": "Saving “{name}”",
+    "open": "Opening “{name}”",
     "forget": "Forgetting a person everywhere",
     "export": "Export “{name}”",
     "profile": "Cost of “{name}”",

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from nicegui import run, ui
 
-from plushsense.dataset.backup import backup_people
 from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
@@ -115,7 +114,14 @@ class DatasetSection:
 
     async def _restore(self, path: Path, readmit: bool) -> None:
         """Start to restore a backup as a new data set; the present one is not changed."""
+        from plushsense.dataset.backup import backup_people
+        from plushsense.workflow.project import is_project
+
         workspace = self._page.workspace
+        if is_project(path):
+            opening = {"file": str(path), "home": str(workspace.folder), "name": path.stem}
+            self._jobs.start("open", opening, self._page.words("Opening “{name}”", name=path.stem))
+            return
         if not readmit:
             refuse_removed(path, await run.io_bound(backup_people, path) or ())
         name = workspace.free_name(DATASETS, path.stem, separator=" ")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from nicegui import run, ui
 
@@ -14,7 +14,9 @@ from plushsense.studio.app.shell import Page, button, heading, named, on_page, t
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import DISCARDED, Workspace
 from plushsense.studio.widgets.elements import folded_lines, on_enter, open_dialog
-from plushsense.workflow.forgetting import HomeTraces, PersonTrace, find_traces, people_of_home
+
+if TYPE_CHECKING:
+    from plushsense.workflow.forgetting import HomeTraces, PersonTrace
 
 _KINDS: Texts = {
     "dataset": "Data set “{name}”: recordings, marks and evaluations of this person",
@@ -64,6 +66,8 @@ class ForgetDialog:
         words = self._words
         title = words("Forget a person everywhere")
         with self._page.show_errors():
+            from plushsense.workflow.forgetting import people_of_home
+
             people = await run.io_bound(people_of_home, self._workspace.folder, self._given) or []
             with open_dialog(title, "forget", "ps-dialog") as self._dialog:
                 heading(title, 2)
@@ -81,6 +85,8 @@ class ForgetDialog:
             ui.spinner(size="1.2em").props("aria-hidden=true")
         found: HomeTraces | None = None
         with self._page.show_errors():
+            from plushsense.workflow.forgetting import find_traces
+
             found = await run.io_bound(find_traces, self._workspace.folder, person, self._given)
         if found is None:
             self._dialog.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
@@ -11,10 +12,10 @@ from nicegui import context, run, ui
 
 from plushsense.core.errors import need
 from plushsense.studio.app.jobs import RUNNING, Jobs
-from plushsense.studio.app.shell import Page, address, button, html, named, on_change, tag
+from plushsense.studio.app.shell import Page, address, button, html, named, on_change, on_page, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import DATASETS, VIRTUAL, WORK
+from plushsense.studio.app.workspace import BACKUPS, DATASETS, VIRTUAL, WORK
 from plushsense.studio.pages.home.datasets import DatasetSection
 from plushsense.studio.pages.home.incoming import IncomingSection
 from plushsense.studio.pages.home.overview import NextStep, Overview, SessionEntry, WorkspaceSummary, next_step
@@ -31,7 +32,6 @@ from plushsense.studio.pages.home.sections import (
 from plushsense.studio.pages.home.toy import ToySection
 from plushsense.studio.widgets.destination import Destination
 from plushsense.studio.widgets.elements import style
-from plushsense.studio.widgets.verdict import show_verdict
 
 _NEXT: Texts = {
     "try": (
@@ -94,6 +94,8 @@ def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], No
                     if entry.dataset:
                         facts.append(page.words("trained on “{name}”", name=entry.dataset))
                     ui.label(" · ".join(facts)).classes("ps-dim")
+                    from plushsense.studio.widgets.verdict import show_verdict
+
                     show_verdict(page.words, entry.score)
                     with ui.row().classes("ps-small-gap"):
                         page_links(page, ("live", "export"), entry.name, model=entry.path)
@@ -131,8 +133,37 @@ def invitation(page: Page) -> None:
         button("invite-new", words("New address"), show)
 
 
-MAKING = ("simulate", "import", "restore")
-CHANGING = (*MAKING, "backup", "forget", "check", "train", "sweep", "search", "export", "publish")
+def project_section(page: Page, jobs: Jobs) -> None:
+    """Build the section; the file is among the backups, and is opened as one, or where files are imported."""
+    words, workspace = page.words, page.workspace
+
+    def save() -> None:
+        stem = words("Everything {date}", date=time.strftime("%Y-%m-%d"))
+        name = workspace.free_name(BACKUPS, stem, ".zip", separator=" ")
+        spec = {
+            "place": str(workspace.folder / BACKUPS / f"{name}.zip"),
+            "datasets": [str(path) for path in workspace.datasets()],
+            "networks": [str(path) for path in workspace.bundles()],
+            "name": name,
+        }
+        with page.show_errors():
+            jobs.start("save", spec, words("Saving “{name}”", name=name))
+
+    with titled_card(page, "Everything in one file", "project"):
+        about = words(
+            "One file holds all data sets and networks, for another computer or a safe place. Opening it adds them and "
+            "replaces nothing. Sessions are saved once they are in a data set."
+        )
+        ui.label(about).classes("ps-dim")
+        with ui.row().classes("ps-small-gap"):
+            button("save-everything", words("Save everything"), on_page(save), icon="save")
+            opener = button("open-everything", words("Open"), icon="folder_open")
+            # In the browser, since it opens its dialog only as the answer to a click.
+            opener.on("click", js_handler="""() => document.querySelector('[data-test="choose_files"]').click()""")
+
+
+MAKING = ("simulate", "import", "restore", "open")
+CHANGING = (*MAKING, "backup", "save", "forget", "check", "train", "sweep", "search", "export", "publish")
 # Enough data to train a network, but simulated within seconds.
 _PEOPLE, _REPETITIONS = 6, 2
 
@@ -154,6 +185,7 @@ async def show(page: Page) -> None:
             discarded = DiscardedSection(page, actions)
         with ui.column().classes("w-full"):
             ToySection(page, toys)
+            project_section(page, jobs)
             job_list = JobList(page, jobs)
             invitation(page)
 
@@ -219,6 +251,8 @@ class NextStepCard:
                     call = partial(put_away, self._page, destination, [s.path for s in waiting], self._refresh)
                 if text := _NEXT_BUTTONS.get(step.key):
                     button("next-button", words(text), call, "unelevated size=lg color=primary")
+                trial = words("Try it with three gestures of your own")
+                button("try-three", trial, lambda: ui.navigate.to(address("live", trial="1")))
                 if second := {"try": "record", "live": "export"}.get(step.key):
                     button("", words(_NEXT_BUTTONS[second]), lambda: self._go(second, step))
 

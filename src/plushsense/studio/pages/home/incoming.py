@@ -29,7 +29,7 @@ from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, heading, on_change, on_page, tag
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace, plain_name
+from plushsense.studio.app.workspace import BACKUPS, BUNDLES, DATASETS, WORK, Workspace, plain_name
 from plushsense.studio.pages.home.sections import simulation_badge, titled_card
 from plushsense.studio.widgets.elements import MAX_LINES, errors_beside, facts, folded_lines, notice
 
@@ -76,6 +76,8 @@ class Incoming:
         """Whether people are taken in who were removed."""
         self.bundles: list[str] = []
         """Names of the networks that were added."""
+        self.projects: list[Path] = []
+        """Projects that were uploaded, now among the backups."""
         self._names: list[str] = []
         self._count = self._bytes = self._tries = 0
 
@@ -123,8 +125,23 @@ class Incoming:
         await file.save(place)
         if kind == ".plush":
             await run.io_bound(self._add_bundle, place)
+        elif kind == ".zip" and await run.io_bound(self._add_project, place):
+            return
         else:
             self._names.append(target.parts[0] if len(target.parts) > 1 else target.stem)
+
+    def _add_project(self, stored: Path) -> bool:
+        """Move an uploaded file to the backups if it is a project; return whether it is."""
+        from plushsense.workflow.project import is_project
+
+        if not is_project(stored):
+            return False
+        name = self._workspace.free_name(BACKUPS, plain_name(stored.stem, "project"), ".zip", separator=" ")
+        place = self._workspace.folder / BACKUPS / f"{name}.zip"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        stored.rename(place)
+        self.projects.append(place)
+        return True
 
     def _add_bundle(self, stored: Path) -> None:
         """Check an uploaded network, and move it to the networks of the studio."""
@@ -262,6 +279,10 @@ class IncomingSection:
             await self._refresh()
         if refused:
             page.say(" ".join(words.sentence(note) for note in refused[:MAX_LINES]), "error")
+        projects, incoming.projects = incoming.projects, []
+        for project in projects:
+            spec = {"file": str(project), "home": str(page.workspace.folder), "name": project.stem}
+            self._jobs.start("open", spec, words("Opening “{name}”", name=project.stem))
         if incoming.sources:
             self._inspect()
 

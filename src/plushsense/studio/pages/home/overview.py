@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import NOBODY
@@ -21,9 +21,11 @@ from plushsense.dataset.privacy.removed import may_be_suggested
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
 from plushsense.recording.session import is_finished
 from plushsense.recording.writer import SessionHead
-from plushsense.studio.app.stored_results import ResultRow, StoredResults
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import BACKUPS, EXPORTS, Workspace, file_stamps
+
+if TYPE_CHECKING:
+    from plushsense.studio.app.stored_results import ResultRow
 
 INDEX = "recordings.csv"
 # Number of recordings in one session of the paper; fewer than this from a single person are too few to train on.
@@ -183,12 +185,20 @@ class Overview:
                 replace(s, active=f"{s.subject}/{s.session}" in active, removed=not may_be_suggested(home, s.subject))
                 for s in read
             )
-            scores = self._workspace.part(StoredResults).networks()
+            scores = self._scores()
             read_bundles = [self._cached(p, _bundle, "") for p in self._workspace.bundles()]
             bundles = tuple(replace(b, score=scores.get(b.path)) for b in read_bundles)
         exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
         backups = tuple(sorted((self._workspace.folder / BACKUPS).glob("*.zip")))
         return WorkspaceSummary(datasets, sessions, bundles, exports, tuple(self._workspace.discarded()), backups)
+
+    def _scores(self) -> dict[Path, ResultRow]:
+        """Return the stored score of each network."""
+        if not self._workspace.bundles():
+            return {}
+        from plushsense.studio.app.stored_results import StoredResults
+
+        return self._workspace.part(StoredResults).networks()
 
     def _cached(self, path: Path, read: Callable[[Path], Any], *files: str) -> Any:
         """Return ``read(path)``, cached until one of the files in ``path`` changes."""

@@ -339,11 +339,14 @@ class JobList:
         page, words, result = self._page, self._page.words, job.result
         if job.task == "check":
             ui.label(findings_text(page, result))
-        if job.task == "backup":
+        if job.task in ("backup", "save"):
             place = Path(job.spec["place"])
             ui.label(words("Written and read back: {file}", file=str(place))).classes("ps-break")
             link = ui.link(words("Download"), download_address(BACKUPS, place.stem)).classes("ps-link")
             tag(link.props("download"), "download")
+        if job.task in ("save", "open"):
+            datasets = words("data sets: {n}", n=len(result["datasets"]))
+            ui.label(f"{datasets} · {words('networks: {n}', n=len(result['networks']))}")
         if job.task == "forget":
             ui.label(words("Removed for good: {n}. Not removed: {left}.", n=result["removed"], left=result["left"]))
             # The receipt names the person, so that it is not stored.

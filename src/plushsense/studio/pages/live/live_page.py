@@ -19,7 +19,7 @@ from plushsense.studio.app.stored_results import ResultRow, StoredResults, recom
 from plushsense.studio.app.toys import ToyInUseError, Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL
-from plushsense.studio.pages.live import adapting, validation_page
+from plushsense.studio.pages.live import adapting, trial, validation_page
 from plushsense.studio.pages.live.event_log import SIMULATIONS, LogButtons
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.live_state import LiveChoice
@@ -42,6 +42,9 @@ async def show(page: Page) -> None:
     reader = page.workspace.part(LiveReader)
     words = page.words
     style()
+    if "trial" in query():
+        trial.show(page, _person_panel)
+        return
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
         _Controls(page, reader, feed, networks)
