@@ -65,6 +65,7 @@ class ScanSettings(TypedDict, total=False):
         pattern: description of files of other projects, or the path of its TOML file.
         streams: folders of people, each with its ``fulldatastream.csv``, in which recordings without a known person are
             found: they get the person and the place in the stream, which undoes their anonymisation.
+        most_files: with a pattern, read only about so many of the files that fit, for a preview; 0 reads all.
     """
 
     layout: Layout | str | Path | None
@@ -76,6 +77,7 @@ class ScanSettings(TypedDict, total=False):
     guess_layout: bool
     pattern: ImportPattern | str | Path | None
     streams: str | Path | None
+    most_files: int
 
 
 class ImportSettings(ScanSettings, total=False):
@@ -137,6 +139,7 @@ def _scan_spec(new_folder: Callable[[str], Path], given: ScanSettings) -> ScanSp
         guess_layout=given.get("guess_layout", False),
         pattern=pattern,
         streams=None if streams is None else Path(streams),
+        most_files=given.get("most_files", 0),
     )
 
 
