@@ -57,6 +57,7 @@ class GuessSpec:
         decimal: sign before the decimals (default: guessed).
         idle: labels that mean that nothing happens.
         name: name of the layout (default: that of the source).
+        recorded: whether files that are named as those of the GestureRecorder are guessed, too, as from other sensors.
     """
 
     parts: Mapping[str, str] = field(default_factory=dict)
@@ -67,6 +68,7 @@ class GuessSpec:
     decimal: str = ""
     idle: tuple[str, ...] = ()
     name: str = ""
+    recorded: bool = False
 
 
 @dataclass

@@ -150,7 +150,7 @@ def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> Gue
             ending=ending,
         )
     some = mine[:: max(1, len(mine) // _FILES)][:_FILES]
-    if sum(_is_recorded(f) for f in some) > 0.8 * len(some):
+    if not given.recorded and sum(_is_recorded(f) for f in some) > 0.8 * len(some):
         raise DatasetError(
             "'{source}' holds recordings of the GestureRecorder: import it without a pattern.", source=source
         )
@@ -551,3 +551,11 @@ def _toml(guess: PatternDraft, name: str) -> str:
     if guess.vectors:
         lines.append(f"vectors = {_value(guess.vectors)}")
     return "\n".join(lines) + "\n"
+
+
+def reusable(toml: str) -> str:
+    """Return the TOML of a guess for further files: without its comments and the paths of single files."""
+    lines = toml.splitlines(keepends=True)
+    excluded = [path for line in lines if line.startswith("exclude = ") for path in json.loads(line[10:])]
+    single = not all(path.startswith("**/") for path in excluded)
+    return "".join(line for line in lines if not line.startswith("#") and not (single and line.startswith("exclude")))

@@ -201,5 +201,5 @@ def _nothing_found(source: Path, spec: ScanSpec, scan: SourceScan) -> DatasetErr
         expected=expected,
         n=len(scan.found),
         first=first,
-        **({"needs": "person"} if unknown else {}),
+        needs="person" if unknown else "files",
     )
