@@ -554,8 +554,14 @@ def _toml(guess: PatternDraft, name: str) -> str:
 
 
 def reusable(toml: str) -> str:
-    """Return the TOML of a guess for further files: without its comments and the paths of single files."""
-    lines = toml.splitlines(keepends=True)
-    excluded = [path for line in lines if line.startswith("exclude = ") for path in json.loads(line[10:])]
-    single = not all(path.startswith("**/") for path in excluded)
-    return "".join(line for line in lines if not line.startswith("#") and not (single and line.startswith("exclude")))
+    """Return the TOML of a guess for further files: without comments, paths of single files and folders around all."""
+    lines = []
+    for line in toml.splitlines(keepends=True):
+        key, _, value = line.partition(" = ")
+        if key == "paths":
+            paths = [re.sub(r"^(?!\*\*/)([^{/]*/)+", "**/", path) for path in json.loads(value)]
+            line = f"paths = {_value(paths)}\n"
+        single = key == "exclude" and not all(path.startswith("**/") for path in json.loads(value))
+        if not line.startswith("#") and not single:
+            lines.append(line)
+    return "".join(lines).lstrip()

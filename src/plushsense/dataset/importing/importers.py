@@ -159,7 +159,9 @@ def _preview(scan: SourceScan) -> ImportPreview:
     recordings = [f for f in files if f.kind == RECORDINGS]
     named = {f.source: f.gesture or name.label for f in recordings if (name := parse_name(f.source.name)) is not None}
     some = recordings or files
-    some = some[:: max(1, len(some) // _PREVIEWED_FILES)][:_PREVIEWED_FILES]
+    # One further each time, since the files of every person may be in the same order of gestures.
+    places = range(0, len(some), max(1, len(some) // _PREVIEWED_FILES))
+    some = [some[min(at + k, len(some) - 1)] for k, at in enumerate(places)][:_PREVIEWED_FILES]
     rows, frames, flags = list[PreviewRow](), list[Frames](), list[tuple[str, str]]()
     rejected = [FileReason(f.origin, f.reason) for f in scan.found if not f.kind]
     for file in some:

@@ -138,15 +138,13 @@ def guess_paths(
                 about="subject",
             )
         )
-    # What is the same in all names stands there as it is, but for the characters of patterns; one name of all files
-    # tells nothing apart, and the next recording may have another.
+    # What is the same in all paths stands there as it is, but for the characters of patterns; a name of all files tells
+    # nothing apart, and the next recording may have another.
     texts = [
         f"{{{role}{limits.get(role, '')}}}" if role in PARTS else role or re.sub("[{}*?]", "?", rows[0][k])
         for k, role in enumerate(roles)
     ]
-    # Folders around all files are those of this computer.
-    inside = next((k for k, role in enumerate(roles[: depth - 1]) if role), depth - 1)
-    folders = (before or "**/" * bool(inside)) + "".join(f"{text}/" for text in texts[inside : depth - 1])
+    folders = before + "".join(f"{text}/" for text in texts[: depth - 1])
     same = len({path.name for path in used}) == 1 and not set(roles[depth - 1 :]) & set(PARTS)
     name = "*" if same else "".join(texts[depth - 1 :])
     found = Counter(row[roles.index("label")] for row in rows) if "label" in roles else Counter[str]()
