@@ -28,7 +28,8 @@ from plushsense.core.files import free_path, write_file
 from plushsense.core.sentences import Message, plain
 from plushsense.dataset.backup import backup, is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
-from plushsense.dataset.importing.guessing import GuessSpec, guess_pattern
+from plushsense.dataset.importing.column_parts import GuessSpec
+from plushsense.dataset.importing.guessing import guess_pattern
 from plushsense.dataset.importing.importers import import_recordings, preview_import, propose
 from plushsense.dataset.importing.results import ImportResult
 from plushsense.dataset.importing.xdf import ENDINGS as XDF
@@ -255,7 +256,7 @@ def _guess(spec: dict[str, Any], reporter: TaskReporter, recorded: bool = True) 
 
     If no file can be read so, ``problem`` is the reason.
     """
-    given = {key: tuple(value) if isinstance(value, list) else value for key, value in spec["given"].items()}
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in spec["given"].items()}
     guessed = guess_pattern(spec["foreign"], GuessSpec(**given, recorded=recorded), UNPACKED)
     result = {"guess": guessed.to_json()}
     try:

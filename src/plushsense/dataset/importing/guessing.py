@@ -559,7 +559,7 @@ def reusable(toml: str) -> str:
     for line in toml.splitlines(keepends=True):
         key, _, value = line.partition(" = ")
         if key == "paths":
-            paths = [re.sub(r"^(?!\*\*/)([^{/]*/)+", "**/", path) for path in json.loads(value)]
+            paths = [re.sub(r"^(?!\*\*/)([^{/]*/)*", "**/", path) for path in json.loads(value)]
             line = f"paths = {_value(paths)}\n"
         single = key == "exclude" and not all(path.startswith("**/") for path in json.loads(value))
         if not line.startswith("#") and not single:

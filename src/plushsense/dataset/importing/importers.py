@@ -173,7 +173,7 @@ def _preview(scan: SourceScan) -> ImportPreview:
         frames.append(read.frames)
         first = read.frames.slice(0, -(-_PREVIEWED_ROWS // len(some)))
         rows += _preview_rows(file, named.get(file.source, ""), first, scan.layout)
-        flags += [(file.origin, str(issue.message)) for issue in clock_still(Examination(read.frames, scan.layout))]
+        flags += [(file.origin, issue.message) for issue in clock_still(Examination(read.frames, scan.layout))]
     notes = [*scan.notes, *counters_note(scan.layout, frames), *group_flags(flags)]
     if scan.gestures is not None and (note := unknown_labels(scan.gestures, named.values())):
         notes.append(note)
