@@ -34,7 +34,7 @@ from plushsense.dataset.importing.importers import import_recordings, preview_im
 from plushsense.dataset.importing.results import ImportResult
 from plushsense.dataset.importing.xdf import ENDINGS as XDF
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.privacy.forget import forget
+from plushsense.dataset.privacy.removed import CONSENT
 from plushsense.dataset.publishing.checking import validate_package
 from plushsense.dataset.store import HEAD
 from plushsense.deploy.profile import profile
@@ -45,12 +45,13 @@ from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.app.workspace import folder_digest, refusal_of
 from plushsense.training.spec import EpochRow
 from plushsense.workflow.api import simulate, train, unfinished
-from plushsense.workflow.config import from_settings
+from plushsense.workflow.config import from_settings, from_stored
 from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
 from plushsense.workflow.export import export
+from plushsense.workflow.forgetting import forget_everywhere
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people, refits
-from plushsense.workflow.reporting import check_folder
+from plushsense.workflow.reporting import check_folder, load_evaluation
 
 
 class TaskReporter:
@@ -123,7 +124,9 @@ def _import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """
     settings: dict[str, Any] = {"add_to": True} if spec.get("add") else {"name": spec.get("name") or None}
     with _collected(spec) as source:
-        done = import_recordings(source, spec["dest"], progress=reporter.count, **settings)
+        done = import_recordings(
+            source, spec["dest"], progress=reporter.count, readmit=spec.get("readmit", False), **settings
+        )
     stored = done.to_json()
     result = {key: stored[key] for key in ("recordings", "subjects", "added", "rejected")}
     return {**result, "dataset": str(spec["dest"]), "warnings": list(done.notes), "flagged": len(done.warnings)}
@@ -160,8 +163,9 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """
     dest, sources = Path(spec["dest"]), [Path(source) for source in spec["sources"]]
     restored = len(sources) == 1 and is_backup(sources[0])
+    readmit = bool(spec.get("readmit"))
     if restored:
-        restore(sources[0], dest, progress=reporter.count)
+        restore(sources[0], dest, progress=reporter.count, readmit=readmit)
         return _contents(dest, [], restored=True)
     if pattern := spec.get("pattern"):
         return _contents(dest, [_import_foreign(spec, pattern, reporter)])
@@ -179,6 +183,7 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
                 guess_layout=not adding,
                 # What a single source proves may not fit the others.
                 adopt_proposals=len(sources) == 1 and not adding,
+                readmit=readmit,
                 limits=UNPACKED,
                 progress=reporter.count,
                 **settings,
@@ -193,13 +198,16 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     first = refused[0][1]
     needs = first.message.values.get("needs")
     files = [file for source in sources for file in (source.rglob("*") if source.is_dir() else [source])]
-    if needs == "person" or any(file.suffix.lower() in XDF for file in files):
+    if needs in ("person", CONSENT) or any(file.suffix.lower() in XDF for file in files):
         raise first
     for pattern in spec["patterns"]:
-        with contextlib.suppress(PlushSenseError):
+        try:
             read = _import_foreign(spec, pattern, reporter)
             if _MOST_REJECTED * len(read.rejected) <= read.recordings + read.streams:
                 return _contents(dest, [read], pattern=pattern)
+        except PlushSenseError as refusal:
+            if refusal.message.values.get("needs") == CONSENT:
+                raise
         shutil.rmtree(dest, ignore_errors=True)
     try:
         return _guess(spec, reporter, recorded=needs == "layout")
@@ -218,6 +226,7 @@ def _import_foreign(spec: dict[str, Any], pattern: str, reporter: TaskReporter) 
         spec["dest"],
         pattern=pattern,
         person=spec["person"] or None,
+        readmit=bool(spec.get("readmit")),
         limits=UNPACKED,
         progress=reporter.count,
     )
@@ -298,20 +307,24 @@ def _restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Restore the backup ``file`` as the new data set ``dest`` with the name ``name``."""
     # One of the studio's own backups: only the disk limits it.
     limits = UnpackLimits(max(1, shutil.disk_usage(Path(spec["file"]).parent).free), files=1 << 30)
-    dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits)
+    readmit = bool(spec.get("readmit"))
+    dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits, readmit=readmit)
     write_file(dataset.path / HEAD, replace(dataset.head, name=spec["name"]).to_toml())
     return {"dataset": str(spec["dest"]), "recordings": len(dataset.recordings), "people": len(dataset.subjects)}
 
 
 def _forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Remove ``person`` from ``dataset``; the result does not name the person.
+    """Remove what is ``chosen`` of the traces of ``person`` in ``home`` and in the data sets ``given``.
 
     Raises:
         ConfigError: if ``person`` is missing, as in a job resumed after a restart, because it is never stored.
     """
     if "person" not in spec:
-        raise ConfigError("The person's code is not stored. Choose the person again in the menu of the data set.")
-    return {"dataset": spec["dataset"], "files": len(forget(spec["dataset"], spec["person"]).files)}
+        raise ConfigError("The person's code is not stored. Choose the person again on the home page.")
+    given = [Path(path) for path in spec["given"]]
+    done = forget_everywhere(Path(spec["home"]), spec["person"], spec["chosen"], given)
+    left = len(done.kept) + len(done.failed) + len(done.found.mentions)
+    return {"removed": len(done.removed), "left": left, "receipt": done.to_json()}
 
 
 def _publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -334,8 +347,12 @@ def _validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`."""
-    config = from_settings(**spec.get("settings", {}))
+    """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`.
+
+    With ``evaluation``, a folder, the settings are those of that evaluation; with ``place``, it is exported.
+    """
+    stored = spec.get("evaluation")
+    config = from_stored(load_evaluation(stored)["config"]) if stored else from_settings(**spec.get("settings", {}))
     if spec.get("dry"):
         from plushsense.workflow.estimate import preview_training
 
@@ -367,7 +384,8 @@ def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         warn=reporter.warn,
     )
     bundle = done.save(free_path(out, done.bundle.to_bytes()))
-    return {"bundle": str(bundle)}
+    exported = _export({"bundle": str(bundle), "place": spec["place"]}, reporter) if spec.get("place") else {}
+    return {"bundle": str(bundle), **exported}
 
 
 def _make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import inspect
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from nicegui.element import Element
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import plain_label
+from plushsense.dataset.privacy.removed import CONSENT
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import (
     Kind,
@@ -53,7 +55,7 @@ _TITLES = {
     "check": "Checking “{name}”",
     "backup": "Backup of “{name}”",
     "restore": "Restoring “{name}”",
-    "forget": "Removing a person from “{name}”",
+    "forget": "Forgetting a person everywhere",
     "export": "Export “{name}”",
     "profile": "Cost of “{name}”",
     "verify": "Verify “{name}”",
@@ -141,6 +143,26 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
         with ui.row().classes("w-full justify-end"):
             button("", words("Cancel"), dialog.close, "flat" if label else "flat autofocus")
             button("ask-go", go, done, "unelevated" if label else "outline")
+
+
+async def admitting(page: Page, work: Callable[[bool], Any]) -> bool:
+    """Call ``work(False)``; if people would come back who were removed, ask, and then call ``work(True)``.
+
+    Returns:
+        Whether the work is done; otherwise it was refused, or the question is open.
+    """
+    words = page.words
+    with page.show_errors():
+        try:
+            if inspect.isawaitable(done := work(False)):
+                await done
+            return True
+        except PlushSenseError as refusal:
+            if refusal.message.values.get("needs") != CONSENT:
+                raise
+            go_on = words("Take them in anyway")
+            ask(words, words.error(refusal), go_on, lambda _: admitting(page, lambda _: work(True)))
+    return False
 
 
 async def change_files(
@@ -289,6 +311,7 @@ class Plot(Element, component="plot.js"):
         x, y: titles of the axes, with units.
         height: height in pixels; the width is that of the surrounding element.
         window_s: length of the visible part of a live plot in seconds, see `push`.
+        share: whether the curves are shares, drawn on an axis from 0 to 1.
     """
 
     def __init__(
@@ -300,11 +323,12 @@ class Plot(Element, component="plot.js"):
         y: str = "",
         height: int = 240,
         window_s: float = 0.0,
+        share: bool = False,
     ) -> None:
         super().__init__()
         self.add_resource(_VENDOR)
         self._props.update(label=label, series=[dict(s) for s in series], xTitle=x, yTitle=y, height=height)
-        self._props.update(windowS=window_s, start=None)
+        self._props.update(windowS=window_s, start=None, share=share)
         self.classes("w-full")
 
     def begin(self, x: Sequence[float], curves: Sequence[Sequence[float | None]]) -> Plot:

@@ -21,12 +21,10 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import layout_names, load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Message
+from plushsense.dataset.files import person_folders
 from plushsense.dataset.importing.archives import UnpackLimits, member_target
-from plushsense.dataset.importing.guessing import reusable
-from plushsense.dataset.importing.results import NO_PEOPLE_OF_PATTERN, SIMULATED
-from plushsense.dataset.importing.sources import LAYOUT_GUESSED
+from plushsense.dataset.privacy.removed import CONSENT, refuse_removed
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
-from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, heading, on_change, on_page, tag
@@ -52,16 +50,17 @@ _ACCEPTED = ".zip,.plush,.csv,.xdf,.xdfz,.parquet,.txt,.tsv,.dat,.json,.jsonl"
 _OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
 
 
-_OF_PREVIEW = (SIMULATED.template, LAYOUT_GUESSED, NO_PEOPLE_OF_PATTERN.template)
-
-
 def _about(file: str, note: Message) -> Message:
     return Message("{file}: {note}", file=file, note=note)
 
 
 def _is_of_preview(note: str | dict[str, Any]) -> bool:
     """Return whether the preview shows a note in another way."""
-    return isinstance(note, dict) and note["template"] in _OF_PREVIEW
+    from plushsense.dataset.importing.results import NO_PEOPLE_OF_PATTERN, SIMULATED
+    from plushsense.dataset.importing.sources import LAYOUT_GUESSED
+
+    hidden = (SIMULATED.template, LAYOUT_GUESSED, NO_PEOPLE_OF_PATTERN.template)
+    return isinstance(note, dict) and note["template"] in hidden
 
 
 class Incoming:
@@ -76,6 +75,8 @@ class Incoming:
         self.dataset = self.folder / "dataset"
         self.pattern = self.folder / "pattern.toml"
         self.refused: list[Message] = []
+        self.readmit = False
+        """Whether people are taken in who were removed."""
         self.bundles: list[str] = []
         """Names of the networks that were added."""
         self._names: list[str] = []
@@ -136,6 +137,8 @@ class Incoming:
 
     def _add_bundle(self, stored: Path) -> None:
         """Check an uploaded network, and move it to the networks of the studio."""
+        from plushsense.models.bundle import Bundle
+
         name = plain_name(stored.stem, "network")
         try:
             if stored.stat().st_size > BUNDLE_BYTES:
@@ -160,11 +163,15 @@ class Incoming:
         Raises:
             ConfigError: for a name that is not a plain file name, or that exists already.
         """
+        if not self.readmit:
+            refuse_removed(self.folder, person_folders(self.dataset))
         place = self._workspace.new(DATASETS, name)
         place.parent.mkdir(parents=True, exist_ok=True)
         write_file(self.dataset / HEAD, replace(DatasetHead.read(self.dataset), name=place.name).to_toml())
         self.dataset.rename(place)
         if self.pattern.exists():
+            from plushsense.dataset.importing.guessing import reusable
+
             kept = self._workspace.folder / PATTERNS / f"{DatasetHead.read(place).layout.name}.toml"
             kept.parent.mkdir(exist_ok=True)
             write_file(kept, reusable(self.pattern.read_text(encoding="utf-8")))
@@ -174,6 +181,7 @@ class Incoming:
     def clear(self) -> None:
         """Remove the files."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        self.readmit = False
         self._names.clear()
         self._count = self._bytes = 0
 
@@ -299,6 +307,7 @@ class IncomingSection:
             "given": mapping.given,
             "pattern": str(incoming.pattern) if incoming.pattern.exists() else "",
             "patterns": [str(path) for path in sorted(patterns.glob("*.toml"))],
+            "readmit": incoming.readmit,
             "dry": True,
         }
         self._ended = False
@@ -362,10 +371,16 @@ class IncomingSection:
             tag(notice(message, "error"), "preview-problem")
         if not result.get("restored"):
             self._settings(unknown_person, "layout" in needs)
+        if CONSENT in needs:
+            button("import-readmit", words("Take them in anyway"), self._readmit)
         if job.state == DONE:
             self._keep_row(result)
         else:
             button("import-cancel", words("Cancel"), on_page(self._cancel), "flat")
+
+    def _readmit(self) -> None:
+        self._incoming.readmit = True
+        self._inspect()
 
     def _contents(self, result: dict[str, Any]) -> None:
         words, people = self._words, result["people"]

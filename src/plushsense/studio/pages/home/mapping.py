@@ -10,8 +10,6 @@ from typing import Any
 from nicegui import ui
 
 from plushsense.core.gestures import NOBODY
-from plushsense.dataset.importing.path_parts import COLUMN
-from plushsense.dataset.importing.results import NO_PEOPLE_OF_PATTERN
 from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.studio.app.shell import heading, on_page, tag
 from plushsense.studio.app.words import Texts, Words
@@ -35,6 +33,7 @@ _SEPARATORS: Texts = {",": "comma", ";": "semicolon", "\t": "tab", "|": "vertica
 _DECIMALS: Texts = {".": "point: 0.5", ",": "comma: 0,5"}
 _FIELDS = "display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 16rem), 1fr)); gap: 4px 16px"
 _MAX_CHANNELS = 6
+_COLUMN = "column"
 
 
 @dataclass
@@ -87,7 +86,7 @@ class MappingPanel:
             for part in _PARTS:
                 self._part(part)
             self._channels()
-            if self._roles.get("label", "").startswith(COLUMN):
+            if self._roles.get("label", "").startswith(_COLUMN):
                 self._several("idle", words("Nothing happens in"), {x: x for x in guess["labels"]}, self._pattern)
         self._doubts("files")
         with tag(ui.element("details").classes("w-full"), "map-more"):
@@ -107,7 +106,7 @@ class MappingPanel:
         """Return what a piece of the paths or a column is called, with examples."""
         words, examples = self._words, ", ".join(candidate["examples"])
         place, _, name = candidate["key"].partition(":")
-        if place == COLUMN:
+        if place == _COLUMN:
             return words("column “{name}”: {examples}", name=name, examples=examples)
         if candidate["in_folder"]:
             return words("name of the folder: {examples}", examples=examples)
@@ -117,7 +116,7 @@ class MappingPanel:
         """Add the choice of the place of a part, and what belongs to it."""
         words, roles = self._words, self._roles
         places = {c["key"]: c for c in self._guess["candidates"]}
-        fitting = [k for k in places if part != "time" or (k.startswith(COLUMN) and places[k]["role"] != "label")]
+        fitting = [k for k in places if part != "time" or (k.startswith(_COLUMN) and places[k]["role"] != "label")]
         options = {key: self._names[key] for key in fitting}
         if part in _NOWHERE:
             options[""] = words(_NOWHERE[part])
@@ -191,6 +190,8 @@ class MappingPanel:
 
     def _rows(self, result: Mapping[str, Any]) -> None:
         """Show some rows as they are understood, or why there are none."""
+        from plushsense.dataset.importing.results import NO_PEOPLE_OF_PATTERN
+
         words = self._words
         if "problem" in result:
             tag(notice(words.failure(result["problem"]), "error"), "mapping-problem")
