@@ -28,7 +28,7 @@ pytestmark = pytest.mark.apart("hostile-results")
 PACKAGE = Path(str(resources.files("plushsense")))
 FILES = sorted((PACKAGE / "studio" / "locale").glob("*.po"))
 TRANSLATORS = {"words", "_words", "w"}
-MESSAGES = {"Message", "error", *(name for name, kind in vars(errors).items() if isinstance(kind, type))}
+MESSAGES = {"Message", "error", "doubt", *(name for name, kind in vars(errors).items() if isinstance(kind, type))}
 
 
 class Source(NamedTuple):

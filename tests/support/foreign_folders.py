@@ -101,3 +101,27 @@ FOLDERS: dict[str, Callable[[Path], None]] = {
     "strokes": strokes,
     "phone-watch": phone_watch,
 }
+
+
+def glove(src: Path, people: tuple[str, ...] = ("S01", "S02", "S03")) -> Path:
+    """Three people, four gestures, five takes, each a file; names of columns of its own, ``;`` and decimal commas."""
+    for p, person in enumerate(people):
+        (src / person).mkdir(parents=True)
+        for g, gesture in enumerate(("hug", "poke", "stroke", "shake")):
+            for take in range(1, 6):
+                left, right = _wave(60, 100 * p + 10 * g + take, 0, 900), _wave(60, 7 * g + take, 100 * g, 100 * g + 90)
+                rows = [f"{0.02 * k:.2f};{left[k]:.1f};{right[k]:.1f}".replace(".", ",") for k in range(60)]
+                text = "\n".join(["Zeit;Druck links;Druck rechts", *rows]) + "\n"
+                (src / person / f"{gesture}-take{take}.csv").write_text(text)
+    return src
+
+
+def diary(src: Path) -> Path:
+    """One file a person, with the label in a column, and rest between the gestures."""
+    src.mkdir(parents=True)
+    for p, person in enumerate(("nora", "otto")):
+        labels = [label for _ in range(3) for word in ("hug", "poke") for label in ["ruhe"] * 30 + [word] * 40]
+        a, b = _wave(len(labels), p, 0, 900), _wave(len(labels), p + 5, 0, 90)
+        rows = [f"{20 * k};{a[k]:.1f};{b[k]:.1f};{label}".replace(".", ",") for k, label in enumerate(labels)]
+        (src / f"{person}.txt").write_text("\n".join(["zeitpunkt;S1;S2;aktion", *rows]) + "\n")
+    return src

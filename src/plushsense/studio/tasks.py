@@ -7,6 +7,7 @@ standard output: ``{"progress": {...}}``, ``{"warning": ...}``, and finally ``{"
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -17,8 +18,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -29,8 +29,13 @@ from plushsense.core.files import free_path, write_file
 from plushsense.core.sentences import Message, plain
 from plushsense.dataset.backup import backup, is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
-from plushsense.dataset.importing.importers import import_recordings, propose
+from plushsense.dataset.importing.column_parts import GuessSpec
+from plushsense.dataset.importing.guessing import guess_pattern
+from plushsense.dataset.importing.importers import import_recordings, preview_import, propose
+from plushsense.dataset.importing.results import ImportResult
+from plushsense.dataset.importing.xdf import ENDINGS as XDF
 from plushsense.dataset.index import open_dataset
+from plushsense.dataset.privacy.removed import CONSENT
 from plushsense.dataset.publishing.checking import validate_package
 from plushsense.dataset.store import HEAD
 from plushsense.deploy.profile import profile
@@ -130,7 +135,7 @@ def _import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     return {**result, "dataset": str(spec["dest"]), "warnings": list(done.notes), "flagged": len(done.warnings)}
 
 
-@contextmanager
+@contextlib.contextmanager
 def _collected(spec: dict[str, Any]) -> Iterator[Path]:
     """Yield a temporary folder with only the chosen sessions, as hard links if the file system supports them."""
     recordings = Path(spec["recordings"])
@@ -155,24 +160,25 @@ def _link_or_copy(source: str, target: str) -> str:
 def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Make the data set ``dest`` of the folder or file of each path in ``sources``; return what it contains.
 
-    A source that cannot be imported is among ``rejected``, unless all are. ``layout`` and ``person`` may be "", see
-    `import_recordings`. A single backup is restored.
+    A source that cannot be imported is among ``rejected``. If none can, ``foreign`` is read as one of the saved
+    ``patterns`` describes it; without one that fits, the result is that of `_guess`. ``pattern`` reads ``foreign`` at
+    once, and ``layout`` and ``person`` may be "", see `import_recordings`. A single backup is restored.
     """
     dest, sources = Path(spec["dest"]), [Path(source) for source in spec["sources"]]
-    notes: list[str] = []
-    rejected: list[dict[str, str]] = []
-    refusals: list[PlushSenseError] = []
     restored = len(sources) == 1 and is_backup(sources[0])
     readmit = bool(spec.get("readmit"))
-    flagged = 0
     if restored:
         restore(sources[0], dest, progress=reporter.count, readmit=readmit)
-        sources = []
+        return _contents(dest, [], restored=True)
+    if pattern := spec.get("pattern"):
+        return _contents(dest, [_import_foreign(spec, pattern, reporter)])
+    done: list[ImportResult] = []
+    refused: list[tuple[str, PlushSenseError]] = []
     for source in sources:
         adding = dest.exists()
         settings: dict[str, Any] = {} if adding or not spec["layout"] else {"layout": spec["layout"]}
         try:
-            done = import_recordings(
+            result = import_recordings(
                 source,
                 dest,
                 add_to=adding,
@@ -185,30 +191,97 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
                 progress=reporter.count,
                 **settings,
             )
+            done.append(result)
         except PlushSenseError as refusal:
-            refusals.append(refusal)
-            rejected.append({"file": source.name, "reason": refusal.message})
-            continue
-        notes += done.notes
-        rejected += [entry.to_json() for entry in done.rejected]
-        flagged += len(done.warnings)
-    if not dest.exists():
-        raise refusals[0]
-    if len(sources) > 1:
-        notes += propose(done, adopting=True).notes[len(done.notes) :]
+            refused.append((source.name, refusal))
+    if done:
+        if len(sources) > 1:
+            done.append(replace(propose(done[-1], adopting=True), warnings=(), rejected=()))
+        return _contents(dest, done, [{"file": file, "reason": cause.message} for file, cause in refused])
+    first = refused[0][1]
+    needs = first.message.values.get("needs")
+    files = [file for source in sources for file in (source.rglob("*") if source.is_dir() else [source])]
+    if needs in ("person", CONSENT) or any(file.suffix.lower() in XDF for file in files):
+        raise first
+    for pattern in spec["patterns"]:
+        try:
+            read = _import_foreign(spec, pattern, reporter)
+            if _MOST_REJECTED * len(read.rejected) <= read.recordings + read.streams:
+                return _contents(dest, [read], pattern=pattern)
+        except PlushSenseError as refusal:
+            if refusal.message.values.get("needs") == CONSENT:
+                raise
+        shutil.rmtree(dest, ignore_errors=True)
+    try:
+        return _guess(spec, reporter, recorded=needs == "layout")
+    except PlushSenseError as unfit:
+        raise (unfit if needs in ("layout", "files") else first) from None
+
+
+_MOST_REJECTED = 10
+"""A saved pattern fits files of which at most one in so many is rejected."""
+
+
+def _import_foreign(spec: dict[str, Any], pattern: str, reporter: TaskReporter) -> ImportResult:
+    """Make the data set ``dest`` of ``foreign`` by a pattern."""
+    return import_recordings(
+        spec["foreign"],
+        spec["dest"],
+        pattern=pattern,
+        person=spec["person"] or None,
+        readmit=bool(spec.get("readmit")),
+        limits=UNPACKED,
+        progress=reporter.count,
+    )
+
+
+def _contents(
+    dest: Path,
+    done: list[ImportResult],
+    rejected: Iterable[dict[str, str]] = (),
+    *,
+    pattern: str = "",
+    restored: bool = False,
+) -> dict[str, Any]:
+    """Return what the data set ``dest`` of some imports contains, and what they noted."""
     dataset = open_dataset(dest)
     return {
         "name": dataset.head.name if restored else "",
         "restored": restored,
+        "pattern": pattern,
         "layout": dataset.head.layout.name,
         "simulated": dataset.head.simulated,
         "recordings": len(dataset.recordings),
         "people": dict(Counter(r.subject for r in dataset.recordings)),
         "gestures": dict(Counter(r.gesture for r in dataset.recordings)),
-        "notes": list(dict.fromkeys(notes)),
-        "flagged": flagged,
-        "rejected": rejected,
+        "notes": list(dict.fromkeys(note for result in done for note in result.notes)),
+        "flagged": sum(len(result.warnings) for result in done),
+        "rejected": [*rejected, *(entry.to_json() for result in done for entry in result.rejected)],
     }
+
+
+_PREVIEWED = 12
+
+
+def _guess(spec: dict[str, Any], reporter: TaskReporter, recorded: bool = True) -> dict[str, Any]:
+    """Guess how ``foreign`` is to be read, with what ``given`` states; return the guess, and some rows of it.
+
+    If no file can be read so, ``problem`` is the reason.
+    """
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in spec["given"].items()}
+    guessed = guess_pattern(spec["foreign"], GuessSpec(**given, recorded=recorded), UNPACKED)
+    result = {"guess": guessed.to_json()}
+    try:
+        seen = preview_import(
+            spec["foreign"],
+            pattern=guessed.pattern,
+            person=spec["person"] or None,
+            limits=UNPACKED,
+            most_files=_PREVIEWED,
+        )
+    except PlushSenseError as refusal:
+        return result | {"problem": refusal.message}
+    return result | {"preview": seen.to_json() | {"left_out": len(seen.left_out)}}
 
 
 def _simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -496,6 +569,7 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "evaluate": _evaluate,
     "import": _import,
     "inspect": _inspect,
+    "guess": _guess,
     "publish": _publish,
     "export": _export,
     "verify": _verify,

@@ -12,41 +12,41 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.core.files import write_file
-from plushsense.core.gestures import plain_label
+from plushsense.core.files import temporary_folder, write_file
 from plushsense.core.recorder_csv import parse_name
-from plushsense.core.sentences import join_names
+from plushsense.core.sentences import Message
 from plushsense.core.toml import load_table, loads_json
+from plushsense.dataset.importing.archives import UnpackLimits, unpack
+from plushsense.dataset.importing.column_parts import (
+    LABEL_NAMES,
+    GuessSpec,
+    PatternDraft,
+    doubt_idle,
+    ends_in,
+    guess_aliases,
+    guess_codes,
+    guess_columns,
+)
 from plushsense.dataset.importing.columns import (
-    CODE_NAMES,
-    MOST_CODES,
     SampledColumn,
-    TableForm,
     find_form,
     is_number,
-    named_column,
-    stated_rate,
 )
-from plushsense.dataset.importing.counters import CLOCK, COUNTER, Floats, no_reading
 from plushsense.dataset.importing.intervals import interval_columns
-from plushsense.dataset.importing.path_parts import MOST_LABELS, PathParts, guess_paths
+from plushsense.dataset.importing.path_parts import COLUMN, Candidate, PathParts, guess_paths
 from plushsense.dataset.importing.pattern import (
     ENDINGS,
     INTERVAL,
-    LABELS,
-    ROLES,
-    UNITS,
     ImportPattern,
     path_expression,
 )
-from plushsense.dataset.importing.sources import source_files, split_regular_files
+from plushsense.dataset.importing.sources import folder_name, source_files, split_regular_files
 from plushsense.dataset.importing.table_files import (
     is_between,
     is_text,
@@ -54,38 +54,40 @@ from plushsense.dataset.importing.table_files import (
     json_objects,
     number_blocks,
     one_recording_each,
-    unit_of_time,
 )
-from plushsense.dataset.quality.measurements import rows_at_one_time
 
 _FILES, _LINES, _FEW = 12, 2000, 5
 _HEAD, _MOST_BYTES, _MOST_JSON = 16_384, 400_000, 64 << 20
-_USUAL_HZ = 50.0
 # The first with which the rows have the same number of cells; a comma may also be in decimals.
 _SEPARATORS = ("\t", ";", "|", ",", " ")
-_MOST_STEPS = 1e7
-_IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
-_LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
-_PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
-# acc_x, x_acc, accX, aX, Accelerometer_x, and x, y, z alone; not accuracy.
-_ACCELERATION = re.compile(r"(?<![a-z])(acc(?!u)|accel|a_?[xyz](?![a-z]))|acc(el)?_?[xyz]?$|^[xyz](_\d+)?$")
-_AXES = ({"x", "y", "z"}, {"0", "1", "2"})
-_NO_CHANNEL = re.compile(r"index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#", re.IGNORECASE)
 # The share of its rows that a recording of the GestureRecorder keeps when it is cut is above 1 / this.
 _MOST_CUT = 20
-_TAKE = re.compile(r"(^|_)(id|sample|take|trial|rep|repetition|recording|segment|window|block|session)", re.IGNORECASE)
 # Files of micro:bit CreateAI name no rate; older ones write ID, newer ones id.
 _MICROBIT_HZ = {"recordings.ID": 40.0, "recordings.id": 50.0}
-# Objects around channels in JSON that say nothing about them.
-_AROUND = re.compile(r"^((recordings|payload|data|sensors|values|samples)\.(?!\d+$))+")
 
 
 @dataclass(frozen=True)
 class GuessedPattern:
-    """The TOML of a pattern, and sentences about what a person should check in it."""
+    """The TOML of a pattern, and sentences about what a person should check in it.
+
+    Attributes:
+        doubts: the value ``about`` of each is what it is about: a part, ``time``, ``channels``, ``rows`` or ``files``.
+        candidates: the pieces of the paths and the columns, with what they are taken for.
+        labels: some of the labels.
+        time_unit: unit of the times, "" without a clock.
+        rate_hz: rate of the layout.
+    """
 
     toml: str
-    doubts: list[str]
+    doubts: list[Message]
+    candidates: tuple[Candidate, ...] = ()
+    labels: tuple[str, ...] = ()
+    time_unit: str = ""
+    rate_hz: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON; the doubts stay messages."""
+        return vars(self) | {"candidates": [asdict(candidate) for candidate in self.candidates]}
 
     @property
     def pattern(self) -> ImportPattern:
@@ -99,42 +101,42 @@ class GuessedPattern:
         write_file(Path(path), self.toml)
 
 
-@dataclass
-class _PatternDraft:
-    """The keys, columns, channels and doubts of the pattern being guessed, filled in step by step."""
+def guess_pattern(
+    source: str | Path, given: GuessSpec | None = None, limits: UnpackLimits | None = None
+) -> GuessedPattern:
+    """Look at the files of a folder or zip, or at one file, and return the pattern that they suggest.
 
-    keys: dict[str, Any] = field(default_factory=dict)
-    taken: set[str] = field(default_factory=set)
-    """Parts that have a column."""
-    columns: dict[str, str] = field(default_factory=dict)
-    channels: list[dict[str, Any]] = field(default_factory=list)
-    vectors: list[list[str]] = field(default_factory=list)
-    labels: Counter[str] = field(default_factory=Counter)
-    rate_hz: float = 0.0
-    times: list[Floats] = field(default_factory=list)
-    """The time of each row of each file or recording; empty without a clock."""
-    codes: dict[str, SampledColumn] = field(default_factory=dict)
-    """Columns of whole numbers that change rarely."""
-    is_json: bool = False
-    width: int = 1
-    separator: str = ""
-    form: TableForm | None = None
-    doubts: list[str] = field(default_factory=list)
-
-
-def guess_pattern(source: str | Path) -> GuessedPattern:
-    """Look at the files of a folder, or at one file, and return the pattern that they suggest.
+    Args:
+        given: what is known already.
+        limits: limits of unpacking a zip.
 
     Raises:
         DatasetError: for a folder without text files.
     """
-    source = Path(source)
+    source, given = Path(source), given or GuessSpec()
     if not source.exists():
         raise DatasetError(f"There is no '{source}': a pattern is guessed from a folder, or from one file.")
-    base, found = (source, source_files(source)) if source.is_dir() else (source.parent, [source])
+    with ExitStack() as stack:
+        base, found = source.parent, [source]
+        if source.suffix.lower() == ".zip":
+            # As `scanning.scan_zip` does.
+            base = stack.enter_context(temporary_folder()) / folder_name(source.stem)
+            base.mkdir()
+            unpack(source, base, limits)
+        elif source.is_dir():
+            base = source
+        if base != source.parent or source.is_dir():
+            found = source_files(base)
+        return _guess(source, base, found, given)
+
+
+def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> GuessedPattern:
+    """Guess the pattern of the files ``found`` below ``base``."""
     files = [f for f in split_regular_files(found)[0] if not f.name.startswith(".") and _is_text(f)]
     if not files:
-        raise DatasetError(f"'{source}' holds no text file: a pattern is guessed from tables of text and JSON lines.")
+        raise DatasetError(
+            "'{source}' holds no text file: a pattern is guessed from tables of text and JSON lines.", source=source
+        )
     sizes: Counter[str] = Counter()
     for file in files:
         sizes[file.suffix.lower()] += file.stat().st_size
@@ -142,13 +144,19 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     of_ending = [f for f in files if f.suffix.lower() == ending]
     mine = [f for f in of_ending if _has_rows(f)]
     if not mine:
-        raise DatasetError(f"'{source}' holds no table: its files that end in '{ending}' have no row with a number.")
+        raise DatasetError(
+            "'{source}' holds no table: its files that end in '{ending}' have no row with a number.",
+            source=source,
+            ending=ending,
+        )
     some = mine[:: max(1, len(mine) // _FILES)][:_FILES]
-    if sum(_is_recorded(f) for f in some) > 0.8 * len(some):
-        raise DatasetError(f"'{source}' holds recordings of the GestureRecorder: import it without a pattern.")
-    guess = _PatternDraft()
+    if not given.recorded and sum(_is_recorded(f) for f in some) > 0.8 * len(some):
+        raise DatasetError(
+            "'{source}' holds recordings of the GestureRecorder: import it without a pattern.", source=source
+        )
+    guess = PatternDraft(given=given)
     if others := len(files) - len(of_ending):
-        guess.doubts.append(f"files that do not end in '{ending}' are left out: {others}")
+        guess.doubt("files that do not end in '{ending}' are left out: {n}", "files", ending=ending, n=others)
     guess.is_json = ENDINGS.get(ending) == "json" or _text(some[0], None, _HEAD).lstrip()[:1] in ("{", "[")
     if guess.is_json:
         columns = _json_columns([_json_text(f, guess) for f in some], guess)
@@ -159,32 +167,61 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     if not guess.is_json:
         mine = [f for f in mine if _fits(_text(f, None, _HEAD).splitlines(), guess)] or mine
     without = sorted(set(of_ending) - set(mine))
-    _roles(columns, guess)
+    guess_columns(columns, guess)
     if not guess.channels:
         listed = ", ".join(column.name.strip()[:30] for column in columns[:20]) or "no columns of one length"
-        raise DatasetError(f"No column of numbers that could be a channel was found in '{source}'; it has {listed}.")
+        raise DatasetError(
+            "No column of numbers that could be a channel was found in '{source}'; it has {listed}.",
+            source=source,
+            listed=listed,
+        )
     parts = _paths(base, mine, without, ending, guess)
     guess.doubts += parts.doubts
     if parts.labels:
         guess.labels = parts.labels
-    _codes(parts, guess)
-    _idle(guess)
-    _aliases(guess)
+    guess_codes(parts, guess)
+    doubt_idle(guess)
+    guess_aliases(guess)
+    if given.idle:
+        guess.keys["idle"] = list(given.idle)
     # Names in the files may hold characters that no line of text can show.
-    guess.doubts = ["".join(c if c.isprintable() else " " for c in doubt) for doubt in guess.doubts]
-    return GuessedPattern(_toml(guess, source.resolve().stem), guess.doubts)
+    doubts = [Message(d.template, **{k: _printable(v) for k, v in d.values.items()}) for d in guess.doubts]
+    guess.doubts = doubts
+    of_columns = [
+        Candidate.of(
+            f"{COLUMN}:{c.key}",
+            guess.roles.get(c.key, ""),
+            (cell.strip() for cell in c.cells if cell.strip()),
+            numeric=c.is_numeric and not c.of_recording,
+        )
+        for c in columns
+    ]
+    return GuessedPattern(
+        _toml(guess, given.name or source.resolve().stem),
+        doubts,
+        (*parts.candidates, *of_columns),
+        tuple(sorted(guess.labels)),
+        guess.time_unit,
+        guess.rate_hz,
+    )
 
 
-def _paths(base: Path, mine: list[Path], without: list[Path], ending: str, guess: _PatternDraft) -> PathParts:
+def _printable(value: Any) -> Any:
+    """Return a value without the characters that no line of text can show."""
+    return "".join(c if c.isprintable() else " " for c in value) if isinstance(value, str) else value
+
+
+def _paths(base: Path, mine: list[Path], without: list[Path], ending: str, guess: PatternDraft) -> PathParts:
     """Find the parts of the paths of the tables ``mine``, and files of intervals among those ``without`` such rows."""
     relative = [f.relative_to(base) for f in mine]
     of_labels = _interval_files(base, without, guess)
     taken = guess.taken | ({"label"} if of_labels else set())
-    parts = guess_paths(relative, ending, taken, set(guess.labels), dotted=INTERVAL in guess.columns)
+    stated = guess.given.parts
+    parts = guess_paths(relative, ending, taken, set(guess.labels), dotted=INTERVAL in guess.columns, stated=stated)
     if of_labels and _intervals(of_labels, relative, parts, guess):
         without = [file for file in without if file.relative_to(base) not in of_labels]
     elif of_labels:
-        parts = guess_paths(relative, ending, guess.taken)
+        parts = guess_paths(relative, ending, guess.taken, stated=stated)
     guess.keys["paths"] = parts.patterns
     _exclude([f.relative_to(base) for f in without], relative, guess)
     return parts
@@ -216,7 +253,7 @@ def _has_rows(path: Path) -> bool:
     return any(line.lstrip()[:1] in ("{", "[") or any(map(is_number, re.split(r"[,;\t| ]", line))) for line in lines)
 
 
-def _text(path: Path, guess: _PatternDraft | None = None, most: int = _MOST_BYTES) -> str:
+def _text(path: Path, guess: PatternDraft | None = None, most: int = _MOST_BYTES) -> str:
     """Return the first bytes of a file as text, without the beginning of a line at the end.
 
     The encoding of a file that is used for ``guess`` is that of the pattern.
@@ -233,7 +270,7 @@ def _text(path: Path, guess: _PatternDraft | None = None, most: int = _MOST_BYTE
     return text[: text.rfind("\n") + 1] or text if cut else text
 
 
-def _json_text(path: Path, guess: _PatternDraft) -> str:
+def _json_text(path: Path, guess: PatternDraft) -> str:
     """Return some lines of JSON, or a whole document of several lines.
 
     Raises:
@@ -258,16 +295,16 @@ def _same(names: Sequence[str], others: Sequence[str]) -> bool:
     return sorted(name.casefold() for name in names) == sorted(name.casefold() for name in others)
 
 
-def _fits(lines: list[str], guess: _PatternDraft) -> bool:
+def _fits(lines: list[str], guess: PatternDraft) -> bool:
     """Return whether a file begins with the columns that were found, and has a row of them."""
     rows = list(_cells(lines, guess.separator))
     form = find_form(rows, guess.width)
     return guess.form is not None and form.begin < len(rows) and _same(form.names, guess.form.names)
 
 
-def _separator(samples: list[list[str]]) -> tuple[int, str]:
+def _separator(samples: list[list[str]], given: str) -> tuple[int, str]:
     """Return the number of cells of most rows, and the separator with which each file has rows of one width."""
-    for separator in _SEPARATORS:
+    for separator in given or _SEPARATORS:
         fitting: Counter[int] = Counter()
         total = 0
         for lines in samples:
@@ -283,12 +320,12 @@ def _separator(samples: list[list[str]]) -> tuple[int, str]:
     return 1, ""
 
 
-def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[SampledColumn]:
+def _text_columns(samples: list[list[str]], guess: PatternDraft) -> list[SampledColumn]:
     """Find separator, lines before and after the names, and the columns of tables of text.
 
     Files with other columns than most rows have are not used: they may be lists of people or labels.
     """
-    width, separator = _separator(samples)
+    width, separator = _separator(samples, guess.given.separator)
     guess.width, guess.separator = width, separator
     tables = [list(_cells(lines, separator)) for lines in samples]
     forms = [find_form(rows, width) for rows in tables]
@@ -304,7 +341,8 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[Sample
     rows = tables[like[0]]
     if separator and separator != ",":
         guess.keys["separator"] = separator
-    if separator == ";" and any(re.fullmatch(r"-?\d+,\d+", cell) for row in rows for cell in row):
+    comma = separator in (";", "\t") and any(re.fullmatch(r"-?\d+,\d+", cell) for row in rows for cell in row)
+    if (guess.given.decimal or "," * comma) == "," != separator:
         guess.keys["decimal"] = ","
     names = list(form.names)
     if form.head is not None:
@@ -312,7 +350,7 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[Sample
     else:
         names = [f"c{k + 1}" for k in range(width)]
         guess.keys |= {"names": names, "skip_before": form.begin}
-        guess.doubts.append("the files have no line of column names: give the columns their names in names")
+        guess.doubt("the files have no line of column names: give the columns their names in names", "channels")
     counts = Counter(name.casefold() for name in names)
     seen: Counter[str] = Counter()
     columns = []
@@ -331,7 +369,7 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[Sample
     return columns
 
 
-def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft) -> None:
+def _row_blocks(samples: list[list[str]], head: list[str], guess: PatternDraft) -> None:
     """Add a doubt if empty lines, comments or lines of column names separate blocks of rows."""
     blocks, markers = 0, Counter[str]()
     for lines in samples:
@@ -346,15 +384,20 @@ def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft)
                 rows += len(row) == guess.width and any(map(is_number, row))
         blocks = max(blocks, int(number_blocks(between, rows).max(initial=0)) + 1)
     if blocks > 1:
-        guess.doubts.append(
+        guess.doubt(
             "empty lines, comments or repeated column names separate blocks of rows: each block is taken for a "
-            f'recording (up to {blocks} in the first lines of a file); if they are no recordings, add  between = "none"'
+            'recording (up to {n} in the first lines of a file); if they are no recordings, add  between = "none"',
+            "recording",
+            n=blocks,
         )
     if markers:
         line = markers.most_common(1)[0][0][:40]
-        guess.doubts.append(
-            f"lines of text stand between rows, such as '{line}': if they separate recordings, describe them with a "
-            f"regular expression, such as  between = '{re.escape(line.split()[0])}.*'"
+        guess.doubt(
+            "lines of text stand between rows, such as '{line}': if they separate recordings, describe them with a "
+            "regular expression, such as  between = '{expression}.*'",
+            "recording",
+            line=line,
+            expression=re.escape(line.split()[0]),
         )
 
 
@@ -371,7 +414,7 @@ def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:
     return csv.reader((line for line in lines if line.strip()), delimiter=separator)
 
 
-def _json_columns(samples: list[str], guess: _PatternDraft) -> list[SampledColumn]:
+def _json_columns(samples: list[str], guess: PatternDraft) -> list[SampledColumn]:
     """Return the values of JSON objects as columns, by their path within an object."""
     cells: dict[str, list[list[str]]] = {}
     lists: set[str] = set()
@@ -384,175 +427,19 @@ def _json_columns(samples: list[str], guess: _PatternDraft) -> list[SampledColum
             cells.setdefault(key, []).extend(parts)
             lists |= {key} if in_list else set()
     if recordings > objects:
-        guess.doubts.append(f"lists within objects are taken for recordings: {recordings} in {objects} objects")
-    guess.rate_hz = next((rate for key, rate in _MICROBIT_HZ.items() if any(_ends(k, key) for k in cells)), 0.0)
+        guess.doubt(
+            "lists within objects are taken for recordings: {n} in {objects} objects",
+            "recording",
+            n=recordings,
+            objects=objects,
+        )
+    guess.rate_hz = next((rate for key, rate in _MICROBIT_HZ.items() if any(ends_in(k, key) for k in cells)), 0.0)
     return [
         SampledColumn(key, key, parts, of_recording=bool(lists) and key not in lists) for key, parts in cells.items()
     ]
 
 
-def _ends(key: str, end: str) -> bool:
-    """Return whether the path of a value in JSON ends in ``end``."""
-    return key == end or key.endswith(f".{end}")
-
-
-def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
-    """Decide which columns are time, person, label and channels."""
-    left = list(columns)
-
-    def take(role: str, column: SampledColumn | None) -> SampledColumn | None:
-        if column is not None:
-            left.remove(column)
-            guess.taken.add(role)
-            if column.name.casefold() not in ROLES[role] or column.key != column.name:
-                guess.columns[role] = column.key
-        return column
-
-    dates = next((c for c in left if c.is_date and not c.of_recording), None)
-    numeric = [c for c in left if c.is_numeric and not c.of_recording]
-    time = (
-        dates or named_column(numeric, (*ROLES["time"], "time", "stamp")) or next(filter(_may_be_clock, numeric), None)
-    )
-    time = _readable_clock(time, left, guess)
-    interval = next((c for c in left if c.of_recording and c.is_numeric and _ends(c.key, INTERVAL)), None)
-    if time is None and interval is not None and min(interval.values) > 0:
-        take(INTERVAL, interval)
-        guess.rate_hz = float(f"{1000.0 / float(np.median(interval.values)):.3g}")
-    else:
-        if time is None and not guess.rate_hz and (stated := stated_rate(columns)) is not None:
-            guess.rate_hz = guess.keys["row_rate_hz"] = stated[1]
-            guess.doubts.append(f"the files have no clock: the rate is that of '{stated[0]}', {stated[1]:g}")
-        _clock(take("time", time), guess)
-    guess.times = time.moments if time is not None else []
-    texts = [c for c in left if not c.is_numeric and c.words and not c.is_date]
-    take("subject", named_column([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)
-    texts = [c for c in texts if c in left]
-    for role in ("session", "recording"):
-        take(role, next((c for c in left if c.name.casefold() in ROLES[role]), None))
-    texts = [c for c in texts if c in left]
-    take("label", _label(texts, left, guess))
-    _unused(left, guess)
-    missing: Counter[str] = Counter()
-    for column in [c for c in left if c.is_numeric and not c.of_recording]:
-        kind = no_reading(_with_times(column, guess.times))
-        if _NO_CHANNEL.fullmatch(column.name.strip()):
-            guess.doubts.append(f"the column '{column.key}' is taken for a number of the row, not for a channel")
-        elif column.codes and (not kind or _TAKE.search(column.name)):
-            guess.codes[column.key] = column
-        elif kind or (column.rises and re.search("time|stamp", column.name.casefold())):
-            guess.doubts.append(f"the column '{column.key}' is taken for {kind or CLOCK}, not for a channel")
-        else:
-            missing += column.words
-            guess.channels.append(_measured(column, guess))
-    if missing:
-        guess.keys["missing"] = sorted(missing)
-        guess.doubts.append(f"the words {', '.join(sorted(missing))} are taken for missing values")
-    _vectors(guess)
-
-
-def _unused(left: list[SampledColumn], guess: _PatternDraft) -> None:
-    """Add a doubt about columns that hold texts in place of numbers: a sensor that was off, or a description."""
-    texts = [c for c in left if not c.is_numeric and c.words and not c.of_recording]
-    if texts:
-        listed = ", ".join(f"'{c.key}' ('{next(iter(c.words))[:30]}')" for c in texts[:_FEW])
-        more = ", …" if len(texts) > _FEW else ""
-        guess.doubts.append(f"columns with texts are no channels: {listed}{more}")
-
-
-def _readable_clock(
-    time: SampledColumn | None, left: list[SampledColumn], guess: _PatternDraft
-) -> SampledColumn | None:
-    """Return the clock, or a column of few dates without one; None with a doubt if it stands still or is unreadable."""
-    words = [c for c in left if not c.is_numeric and c.words and not c.of_recording]
-    unread = named_column(words, (*ROLES["time"], "time", "stamp"))
-    if time is None and unread is not None and unread.holds_dates:
-        time = unread
-    if time is not None and (still := rows_at_one_time(time.times)):
-        left.remove(time)
-        guess.doubts.append(
-            f"the clock in '{time.key}' stands still ({still} rows in turn have the same time), as where a spreadsheet "
-            "or float32 cut digits off: export its times again, or let row_rate_hz stand instead of it"
-        )
-        return None
-    if time is None and unread is not None and re.search(r"\d", next(iter(unread.words))):
-        left.remove(unread)
-        guess.doubts.append(
-            f"the times in '{unread.key}', such as '{next(iter(unread.words))[:30]}', cannot be read: write them as "
-            "2026-03-01 12:01:02.5, as 12:01:02.5, or as numbers"
-        )
-    return time
-
-
-def _with_times(column: SampledColumn, times: list[Floats]) -> list[tuple[Floats, Floats]]:
-    """Return the numbers of a column in each file or recording, and their times, or the numbers of the rows."""
-    fits = [len(a) for a in column.numbers] == [len(b) for b in times]
-    return list(zip(column.numbers, times if fits else [np.arange(float(len(a))) for a in column.numbers], strict=True))
-
-
-def _may_be_clock(column: SampledColumn) -> bool:
-    """Return whether a column rises, and does not only count the rows."""
-    return column.rises and no_reading(_with_times(column, [])) != COUNTER
-
-
-def _label(texts: list[SampledColumn], left: list[SampledColumn], guess: _PatternDraft) -> SampledColumn | None:
-    """Return the column of labels: by its name, or else the first one of few texts, a ``name`` before others."""
-    label = named_column(texts, (*ROLES["label"], *_LABEL_NAMES))
-    numbers = next((c for c in left if c.name.strip().casefold() in CODE_NAMES and c.codes), None)
-    if label is None and numbers is not None:
-        guess.labels = Counter(map(str, numbers.codes))
-        guess.doubts.append(f"the labels in '{numbers.key}' are numbers: give them their names in [aliases]")
-        return numbers
-    if label is None:
-        # A device describes itself in texts, and what differs in every file is an identifier.
-        few = [
-            c
-            for c in texts
-            if 1 < len(c.words) <= MOST_LABELS and INTERVAL not in guess.columns
-            if len(c.words) < len(c.parts) or any(len(set(cells)) > 1 for cells in c.parts)
-        ]
-        mixed = [c for c in few if c.alternates]
-        for column in mixed:
-            listed = join_names(repr(word) for word in list(column.words)[:2])
-            guess.doubts.append(
-                f"the column '{column.key}' changes from row to row ({listed}), so that it is not taken for the label: "
-                "if it names sensors, their rows are mixed; write a table with a column for each sensor"
-            )
-        few = [c for c in few if c not in mixed]
-        label = next(iter([*(c for c in few if _ends(c.key.casefold(), "name")), *few]), None)
-        if label is not None:
-            listed = ", ".join(repr(word) for word in list(label.words)[:2])
-            guess.doubts.append(f"the column '{label.key}' is taken for the label: {listed}")
-    if label is not None:
-        guess.labels = label.words
-    return label
-
-
-def _codes(parts: PathParts, guess: _PatternDraft) -> None:
-    """Take whole numbers that change rarely for the label or the take, if there is no other; list the others."""
-    labelled = bool(guess.labels) or "intervals" in guess.keys
-    takes = [c for c in guess.codes.values() if c.counts and (labelled or _TAKE.search(c.name))]
-    may_be = [c for c in guess.codes.values() if c not in takes and len(c.codes) <= MOST_CODES]
-    for column in sorted(guess.codes.values(), key=lambda c: not named_column([c], CODE_NAMES)):
-        values = ", ".join(map(str, column.codes[:6]))
-        seen = f"the column '{column.key}' has whole numbers that change rarely ({values}), so that it is"
-        if column in may_be and not labelled:
-            labelled = True
-            guess.columns["label"] = column.key
-            guess.labels = Counter(map(str, column.codes))
-            guess.doubts.append(f"{seen} taken for the label: give them names in [aliases]")
-        elif column in takes and "recording" not in guess.taken | parts.found:
-            guess.taken.add("recording")
-            guess.columns["recording"] = column.key
-            guess.doubts.append(f"{seen} taken for the take: a recording ends where it changes")
-        else:
-            guess.doubts.append(
-                f"{seen} no channel: if it is a sensor, add it to channels, and if it is the label, to columns"
-            )
-    if not labelled:
-        guess.doubts.append("the label of a recording was not found: put {label} into paths, or give its column")
-
-
-def _interval_files(base: Path, without: list[Path], guess: _PatternDraft) -> dict[Path, dict[str, str]]:
+def _interval_files(base: Path, without: list[Path], guess: PatternDraft) -> dict[Path, dict[str, str]]:
     """Return the files of intervals among those with other columns, and the names of their columns."""
     found: dict[Path, dict[str, str]] = {}
     moments = []
@@ -562,30 +449,38 @@ def _interval_files(base: Path, without: list[Path], guess: _PatternDraft) -> di
         names = [name.strip() for name in next(csv.reader(lines, delimiter=separator), [])]
         if len(lines) > 1 and (at := interval_columns(names)):
             found[file.relative_to(base)] = {role: names[k] for role, k in at.items()}
-        elif {name.casefold() for name in names} & {*_LABEL_NAMES} and any("time" in n.casefold() for n in names):
+        elif {name.casefold() for name in names} & {*LABEL_NAMES} and any("time" in n.casefold() for n in names):
             moments.append(file.relative_to(base).as_posix())
     if moments and not found:
-        guess.doubts.append(
-            f"files such as {moments[0]} have labels of single moments, which cannot be used: give each a start and an "
-            "end (columns start, end, label)"
+        guess.doubt(
+            "files such as {file} have labels of single moments, which cannot be used: give each a start and an end "
+            "(columns start, end, label)",
+            "label",
+            file=moments[0],
         )
     return found
 
 
-def _intervals(found: dict[Path, dict[str, str]], samples: list[Path], parts: PathParts, guess: _PatternDraft) -> bool:
+def _intervals(found: dict[Path, dict[str, str]], samples: list[Path], parts: PathParts, guess: PatternDraft) -> bool:
     """Use files of intervals for the labels; return whether their paths fit those of the samples."""
     patterns = {_place_of(path, samples, parts.patterns) for path in found}
     path, columns = next(iter(found.items()))
     pattern = patterns.pop()
     if patterns or pattern is None:
-        guess.doubts.append(
-            f"files such as {path.as_posix()} have intervals, but do not fit the paths of the samples: name them in "
-            "intervals"
+        guess.doubt(
+            "files such as {file} have intervals, but do not fit the paths of the samples: name them in intervals",
+            "label",
+            file=path.as_posix(),
         )
         return False
     guess.keys["intervals"] = pattern
     guess.columns |= columns
-    guess.doubts.append(f"the labels are the intervals in files such as {path.as_posix()}: '{columns['label']}'")
+    guess.doubt(
+        "the labels are the intervals in files such as {file}: '{column}'",
+        "label",
+        file=path.as_posix(),
+        column=columns["label"],
+    )
     return True
 
 
@@ -604,7 +499,7 @@ def _place_of(path: Path, samples: list[Path], patterns: list[str]) -> str | Non
     return max(best, key=lambda made: made.count("{"), default=None)
 
 
-def _exclude(without: list[Path], samples: list[Path], guess: _PatternDraft) -> None:
+def _exclude(without: list[Path], samples: list[Path], guess: PatternDraft) -> None:
     """Leave out files with other columns, by their name if no file of samples has it."""
     if len(without) > _FEW:
         fit = [path_expression(text) for text in guess.keys["paths"]]
@@ -618,123 +513,7 @@ def _exclude(without: list[Path], samples: list[Path], guess: _PatternDraft) -> 
     texts = [f"**/{path.name}" if many and path.name not in names else path.as_posix() for path in excluded]
     guess.keys["exclude"] = [re.sub("[{}?]", "?", text) for text in dict.fromkeys(texts)]
     listed = ", ".join(path.as_posix() for path in without[:_FEW]) + (", …" if len(without) > _FEW else "")
-    guess.doubts.append(f"files without such rows are left out: {listed}")
-
-
-def _clock(time: SampledColumn | None, guess: _PatternDraft) -> None:
-    """Find the unit of the times, and the rate."""
-    if time is None and "row_rate_hz" in guess.keys:
-        return
-    if time is None:
-        guess.doubts.append(
-            f"the files have no clock; micro:bit CreateAI has {guess.rate_hz:g} rows a second with this key (40: ID, "
-            "50: id): if recordings of 1.8 s have about 92 rows, correct row_rate_hz and rate_hz to 50"
-            if guess.rate_hz
-            else f"the files have no clock: give the true rate as row_rate_hz and rate_hz, now {_USUAL_HZ:g}"
-        )
-        guess.keys["row_rate_hz"] = guess.rate_hz = guess.rate_hz or _USUAL_HZ
-        return
-    numbers = time.times
-    if time.words and time.holds_dates:
-        guess.keys["time_unit"], factor = "iso", 1000.0
-    else:
-        unit, stated = unit_of_time(time.name, numbers, _USUAL_HZ)
-        factor = UNITS[unit]
-        if not stated:
-            guess.keys["time_unit"] = unit
-            guess.doubts.append(f"the times in '{time.key}' are taken for {unit}")
-    steps = np.diff(numbers)
-    steps = steps[steps > 0]
-    period = float(np.median(steps)) * factor if len(steps) else 1000.0 / _USUAL_HZ
-    guess.rate_hz = float(f"{min(max(1000.0 / period, 1.0), 10_000.0):.3g}")
-
-
-def _channel(name: str, kind: str, **more: Any) -> dict[str, Any]:
-    return {"name": name, "unit": "", "kind": kind, **more}
-
-
-def _measured(column: SampledColumn, guess: _PatternDraft) -> dict[str, Any]:
-    """Return the channel of a column of numbers: its kind, and a step that keeps its decimals."""
-    key = _AROUND.sub("", column.key) if guess.is_json else column.key
-    # A channel has no number for a name, since it would look like a reading at the head of a table.
-    key = f"c{key.lstrip('#')}" if not column.name or column.name.isdecimal() else key
-    name = re.sub(r"\W+", "_", key.casefold()).strip("_") or f"channel{len(guess.channels) + 1}"
-    if name != column.name.casefold() or column.key != column.name:
-        guess.columns[name] = column.key
-    values = column.values
-    texts = [cell.strip().replace(",", ".") for cell in column.cells]
-    digits = min(6, max((len(t.partition(".")[2]) for t in texts if is_number(t) and "e" not in t.lower()), default=0))
-    is_acceleration = _ACCELERATION.search(name) is not None
-    if set(values.tolist()) <= {0.0, 1.0} and not digits and not is_acceleration:
-        return _channel(name, "binary", valid_min=0, valid_max=1)
-    # Whole numbers of steps have to fit 32 bits, and the square of a magnitude of three axes 64.
-    while digits and np.abs(values).max() * 10**digits > _MOST_STEPS:
-        digits -= 1
-    more: dict[str, Any] = {"step": float(f"1e-{digits}")} if digits else {}
-    if is_acceleration:
-        # A magnitude needs a range; twice the largest value is a guess at that of the sensor.
-        limit = float(2 ** int(np.ceil(np.log2(max(2 * np.abs(values).max(), 1.0)))))
-        return _channel(name, "acceleration", **more, valid_min=-limit, valid_max=limit)
-    return _channel(name, "sensor", **more)
-
-
-def _vectors(guess: _PatternDraft) -> None:
-    """Find triples of accelerations whose names differ only in x, y and z, or that are a list of three in JSON."""
-    by_stem: dict[str, dict[str, str]] = {}
-    for channel in guess.channels:
-        text = channel["name"].replace("_", " ")
-        axis = re.search(r"(?:(?<![a-z])a?|acc|accel)([xyz])(?![a-z])|([xyz])$", text)
-        if channel["kind"] == "acceleration" and axis is not None and (at := axis.lastindex):
-            stem = channel["name"][: axis.start(at)] + "?" + channel["name"][axis.end(at) :]
-            by_stem.setdefault(stem, {})[axis[at]] = channel["name"]
-        elif (
-            channel["kind"] == "acceleration"
-            and guess.is_json
-            and (item := re.fullmatch(r"(.+_)(\d+)", channel["name"]))
-        ):
-            by_stem.setdefault(item[1], {})[item[2]] = channel["name"]
-    guess.vectors = [[axes[a] for a in sorted(axes)] for axes in by_stem.values() if set(axes) in _AXES]
-    _ranges(guess)
-
-
-def _ranges(guess: _PatternDraft) -> None:
-    """Give the axes of one vector the same range, the largest of theirs, and the same step."""
-    accelerations = {c["name"]: c for c in guess.channels if c["kind"] == "acceleration"}
-    alone = [[name] for name in accelerations if not any(name in vector for vector in guess.vectors)]
-    for names in [*guess.vectors, *alone]:
-        limit = max(accelerations[name]["valid_max"] for name in names)
-        step = min(accelerations[name].get("step", 1.0) for name in names)
-        for name in names:
-            accelerations[name] |= {"step": step} if step < 1.0 else {}
-            accelerations[name] |= {"valid_min": -limit, "valid_max": limit}
-        listed = ", ".join(f"'{name}'" for name in names)
-        guess.doubts.append(f"the range of {listed} is guessed (±{limit:g}): give that of the sensor")
-
-
-def _idle(guess: _PatternDraft) -> None:
-    """Add a doubt about labels that may stand for idle time."""
-    found = [label for label in guess.labels if plain_label(label) in _IDLE_LABELS]
-    if "label" in guess.taken and found:
-        guess.doubts.append(
-            f"rows with the label {', '.join(map(repr, found))} are taken for a gesture: if nothing happens in them, "
-            f"add  idle = {json.dumps(found, ensure_ascii=False)}"
-        )
-
-
-def _aliases(guess: _PatternDraft) -> None:
-    """Find spellings of one label that differ in more than case, spaces and underlines."""
-    groups: dict[str, Counter[str]] = {}
-    for label, count in guess.labels.items():
-        groups.setdefault(re.sub(r"[\W_]+", "", label.casefold()), Counter())[label] = count
-    aliases = {}
-    for spellings in groups.values():
-        if len({plain_label(s) for s in spellings}) > 1:
-            # The spelling with separate words reads best.
-            best = max(spellings, key=lambda s: (len(s), spellings[s]))
-            aliases[best] = sorted(s for s in spellings if s != best)
-            guess.doubts.append(f"{', '.join(repr(s) for s in sorted(spellings))} are taken for one label")
-    if aliases:
-        guess.keys["aliases"] = aliases
+    guess.doubt("files without such rows are left out: {listed}", "files", listed=listed)
 
 
 def _value(value: Any) -> str:
@@ -750,7 +529,7 @@ def _key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
 
 
-def _toml(guess: _PatternDraft, name: str) -> str:
+def _toml(guess: PatternDraft, name: str) -> str:
     """Return the TOML of a guess, with what is uncertain as comments at its beginning."""
     lines = [
         f"# Guessed from the files in {json.dumps(name)}. Look at it, then see ten rows with",
@@ -772,3 +551,17 @@ def _toml(guess: _PatternDraft, name: str) -> str:
     if guess.vectors:
         lines.append(f"vectors = {_value(guess.vectors)}")
     return "\n".join(lines) + "\n"
+
+
+def reusable(toml: str) -> str:
+    """Return the TOML of a guess for further files: without comments, paths of single files and folders around all."""
+    lines = []
+    for line in toml.splitlines(keepends=True):
+        key, _, value = line.partition(" = ")
+        if key == "paths":
+            paths = [re.sub(r"^(?!\*\*/)([^{/]*/)*", "**/", path) for path in json.loads(value)]
+            line = f"paths = {_value(paths)}\n"
+        single = key == "exclude" and not all(path.startswith("**/") for path in json.loads(value))
+        if not line.startswith("#") and not single:
+            lines.append(line)
+    return "".join(lines).lstrip()

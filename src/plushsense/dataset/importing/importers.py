@@ -66,6 +66,7 @@ class ScanSettings(TypedDict, total=False):
         pattern: description of files of other projects, or the path of its TOML file.
         streams: folders of people, each with its ``fulldatastream.csv``, in which recordings without a known person are
             found: they get the person and the place in the stream, which undoes their anonymisation.
+        most_files: with a pattern, read only about so many of the files that fit, for a preview; 0 reads all.
     """
 
     layout: Layout | str | Path | None
@@ -77,6 +78,7 @@ class ScanSettings(TypedDict, total=False):
     guess_layout: bool
     pattern: ImportPattern | str | Path | None
     streams: str | Path | None
+    most_files: int
 
 
 class ImportSettings(ScanSettings, total=False):
@@ -140,6 +142,7 @@ def _scan_spec(new_folder: Callable[[str], Path], given: ScanSettings) -> ScanSp
         guess_layout=given.get("guess_layout", False),
         pattern=pattern,
         streams=None if streams is None else Path(streams),
+        most_files=given.get("most_files", 0),
     )
 
 
@@ -159,7 +162,9 @@ def _preview(scan: SourceScan) -> ImportPreview:
     recordings = [f for f in files if f.kind == RECORDINGS]
     named = {f.source: f.gesture or name.label for f in recordings if (name := parse_name(f.source.name)) is not None}
     some = recordings or files
-    some = some[:: max(1, len(some) // _PREVIEWED_FILES)][:_PREVIEWED_FILES]
+    # One further each time, since the files of every person may be in the same order of gestures.
+    places = range(0, len(some), max(1, len(some) // _PREVIEWED_FILES))
+    some = [some[min(at + k, len(some) - 1)] for k, at in enumerate(places)][:_PREVIEWED_FILES]
     rows, frames, flags = list[PreviewRow](), list[Frames](), list[tuple[str, str]]()
     rejected = [FileReason(f.origin, f.reason) for f in scan.found if not f.kind]
     for file in some:
@@ -171,7 +176,7 @@ def _preview(scan: SourceScan) -> ImportPreview:
         frames.append(read.frames)
         first = read.frames.slice(0, -(-_PREVIEWED_ROWS // len(some)))
         rows += _preview_rows(file, named.get(file.source, ""), first, scan.layout)
-        flags += [(file.origin, str(issue.message)) for issue in clock_still(Examination(read.frames, scan.layout))]
+        flags += [(file.origin, issue.message) for issue in clock_still(Examination(read.frames, scan.layout))]
     notes = [*scan.notes, *counters_note(scan.layout, frames), *group_flags(flags)]
     if scan.gestures is not None and (note := unknown_labels(scan.gestures, named.values())):
         notes.append(note)

@@ -158,7 +158,13 @@ class ImportPreview:
 _PARTS = re.compile(r"\([^()]*\)|'[^']*'|(?<= as ).+|[+-]?\d+(?:\.\d+)?( \w+?)?s?\b")
 
 
-def group_flags(flags: Iterable[tuple[str, str]], noun: str = "recordings or streams") -> list[str]:
+_SEVERAL = {
+    "files": "{n} files, for instance {file}: {note}",
+    "recordings or streams": "{n} recordings or streams, for instance {file}: {note}",
+}
+
+
+def group_flags(flags: Iterable[tuple[str, str]], noun: str = "recordings or streams") -> list[Message]:
     """Return one warning for each kind of flag.
 
     Args:
@@ -170,7 +176,9 @@ def group_flags(flags: Iterable[tuple[str, str]], noun: str = "recordings or str
     for identity, flag in flags:
         kinds.setdefault(_PARTS.sub(lambda part: f"#{part[1] or ''}", flag), []).append((identity, flag))
     return [
-        (f"{len(found)} {noun}, for instance " if len(found) > 1 else "") + ": ".join(found[0])
+        Message(
+            _SEVERAL[noun] if len(found) > 1 else "{file}: {note}", n=len(found), file=found[0][0], note=found[0][1]
+        )
         for found in kinds.values()
     ]
 

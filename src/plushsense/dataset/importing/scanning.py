@@ -63,9 +63,14 @@ def scan_pattern(source: Path, spec: ScanSpec, *, around: Path | None = None) ->
         with scan.refusing(file, name):
             tables.intervals.append(read_intervals(file, name, pattern, place))
             scan.found.append(SourceFile(file, LEFT_OUT, origin=name, reason="its intervals label other files"))
-    for file in (f for f in files if f not in of_labels):
+    places = {f: pattern.match(f.relative_to(base).as_posix()) for f in files if f not in of_labels}
+    fitting = [file for file, parts in places.items() if parts is not None]
+    chosen = set(fitting[:: max(1, len(fitting) // spec.most_files)] if spec.most_files else fitting)
+    for file, parts in places.items():
         relative = file.relative_to(base)
-        name, parts = printable_path(relative), pattern.match(relative.as_posix())
+        name = printable_path(relative)
+        if parts is not None and file not in chosen:
+            continue
         if parts is None:
             excluded = pattern.excluded_by(relative.as_posix())
             fits_none = f"fits no path of the pattern: {', '.join(pattern.paths)}"
@@ -196,5 +201,5 @@ def _nothing_found(source: Path, spec: ScanSpec, scan: SourceScan) -> DatasetErr
         expected=expected,
         n=len(scan.found),
         first=first,
-        **({"needs": "person"} if unknown else {}),
+        needs="person" if unknown else "files",
     )

@@ -193,6 +193,7 @@ class ScanSpec:
     guess_layout: bool = False
     pattern: ImportPattern | None = None
     streams: Path | None = None
+    most_files: int = 0
 
     def begin_scan(self, shape: str, files: Iterable[Path], own: Layout | None = None) -> SourceScan:
         """Begin the scan of a source with the layout ``own``, else the given one, else that of the files."""

@@ -182,8 +182,10 @@ def channel_columns(layout: Layout) -> list[int]:
         name = _ALIASES.get(name, name)
         if name not in CHANNELS:
             raise ConfigError(
-                f"The virtual toy has no sensor '{name}' of layout '{layout.name}'; "
-                "it supports plush-15, plush-14 and accel-3."
+                "The virtual toy has no sensor '{name}' of layout '{layout}'; it supports plush-15, plush-14 and "
+                "accel-3.",
+                name=name,
+                layout=layout.name,
             )
         columns.append(CHANNELS.index(name))
     return columns

@@ -27,6 +27,8 @@ RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bu
 WORK, DISCARDED, BACKUPS = "work", "discarded", "backups"
 PROTOCOLS = "protocols"
 """Folder of the user's own recording protocols."""
+PATTERNS = "patterns"
+"""Folder of the patterns by which files of other sensors are read."""
 VIRTUAL = "virtual://?person=7"
 _HEAD = "dataset.toml"
 _BUNDLE = "*.plush"

@@ -29,7 +29,8 @@ from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, heading, on_change, on_page, tag
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import BACKUPS, BUNDLES, DATASETS, WORK, Workspace, plain_name
+from plushsense.studio.app.workspace import BACKUPS, BUNDLES, DATASETS, PATTERNS, WORK, Workspace, plain_name
+from plushsense.studio.pages.home.mapping import FileMapping, MappingPanel
 from plushsense.studio.pages.home.sections import simulation_badge, titled_card
 from plushsense.studio.widgets.elements import MAX_LINES, errors_beside, facts, folded_lines, notice
 
@@ -44,7 +45,7 @@ ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
 """Maximum size of an uploaded file in bytes; the request that carries it is slightly larger."""
 BUNDLE_BYTES = 64_000_000
 _LIMITS = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
-_ACCEPTED = ".zip,.plush,.csv,.xdf,.xdfz,.parquet"
+_ACCEPTED = ".zip,.plush,.csv,.xdf,.xdfz,.parquet,.txt,.tsv,.dat,.json,.jsonl"
 # Files that desktops leave in folders; nobody chose them.
 _OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
 
@@ -55,10 +56,11 @@ def _about(file: str, note: Message) -> Message:
 
 def _is_of_preview(note: str | dict[str, Any]) -> bool:
     """Return whether the preview shows a note in another way."""
-    from plushsense.dataset.importing.results import SIMULATED
+    from plushsense.dataset.importing.results import NO_PEOPLE_OF_PATTERN, SIMULATED
     from plushsense.dataset.importing.sources import LAYOUT_GUESSED
 
-    return isinstance(note, dict) and note["template"] in (SIMULATED.template, LAYOUT_GUESSED)
+    hidden = (SIMULATED.template, LAYOUT_GUESSED, NO_PEOPLE_OF_PATTERN.template)
+    return isinstance(note, dict) and note["template"] in hidden
 
 
 class Incoming:
@@ -71,6 +73,7 @@ class Incoming:
         self._workspace = workspace
         self.folder = workspace.folder / WORK / INCOMING / uuid.uuid4().hex
         self.dataset = self.folder / "dataset"
+        self.pattern = self.folder / "pattern.toml"
         self.refused: list[Message] = []
         self.readmit = False
         """Whether people are taken in who were removed."""
@@ -86,6 +89,12 @@ class Incoming:
         """The files and the folder to import."""
         single = sorted((self.folder / "single").glob("*"))
         return [*single, *(p for p in (self.folder / "files",) if p.is_dir())]
+
+    @property
+    def foreign(self) -> Path:
+        """The one source in which files of other sensors are looked for."""
+        single = list((self.folder / "single").glob("*"))
+        return single[0] if len(single) == 1 else self.folder / ("single" if single else "files")
 
     @property
     def name(self) -> str:
@@ -166,6 +175,8 @@ class Incoming:
     def keep(self, name: str) -> Path:
         """Move the data set that was made of the files to the data sets of the studio, and remove the files.
 
+        A pattern that a person has confirmed is kept for further files.
+
         Raises:
             ConfigError: for a name that is not a plain file name, or that exists already.
         """
@@ -175,6 +186,12 @@ class Incoming:
         place.parent.mkdir(parents=True, exist_ok=True)
         write_file(self.dataset / HEAD, replace(DatasetHead.read(self.dataset), name=place.name).to_toml())
         self.dataset.rename(place)
+        if self.pattern.exists():
+            from plushsense.dataset.importing.guessing import reusable
+
+            kept = self._workspace.folder / PATTERNS / f"{DatasetHead.read(place).layout.name}.toml"
+            kept.parent.mkdir(exist_ok=True)
+            write_file(kept, reusable(self.pattern.read_text(encoding="utf-8")))
         self.clear()
         return place
 
@@ -226,8 +243,8 @@ class IncomingSection:
         self._incoming = Incoming(page.workspace)
         self._job: StudioJob | None = None
         self._problem: Exception | None = None
-        self._progress: ui.label | None = None
-        self._layout = self._person = ""
+        self._layout = ""
+        self._mapping = FileMapping()
         self._ended = True
         words = self._words
         with titled_card(page, "Import files", "incoming"):
@@ -246,6 +263,11 @@ class IncomingSection:
                     # In the browser, since it opens its dialog only as the answer to a click.
                     files.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [false])")
                     folder.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [true])")
+            self._busy = ui.row().classes("items-center ps-small-gap").props('role="status"')
+            with self._busy:
+                ui.spinner(size="1.2em").props("aria-hidden=true")
+                self._progress = tag(ui.label(), "inspecting")
+            self._busy.set_visibility(False)
             self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
         on_change(jobs.changed, self._update)
         context.client.on_delete(self._leave)
@@ -288,63 +310,94 @@ class IncomingSection:
 
     # Preview --------------------------------------------------------------------------------------------------
 
-    def _inspect(self) -> None:
-        """Start the job that makes a data set of the files, with the current layout and person."""
+    def _inspect(self, task: str = "inspect") -> None:
+        """Start the job that makes a data set of the files, or guesses how to read them, with what is stated."""
         if self._job is not None:
             self._jobs.stop(self._job.id)
+        incoming, workspace, mapping = self._incoming, self._page.workspace, self._mapping
+        patterns = workspace.folder / PATTERNS
+        if "name" not in mapping.given:
+            plain = plain_name(incoming.name, self._words("recordings"))
+            mapping.given["name"] = workspace.free_name(PATTERNS, plain, ".toml", taken=layout_names())
         spec = {
-            "sources": [str(path) for path in self._incoming.sources],
-            "dest": str(self._incoming.new_dataset()),
+            "sources": [str(path) for path in incoming.sources],
+            "foreign": str(incoming.foreign),
+            "dest": str(incoming.new_dataset()),
             "layout": self._layout,
-            "person": self._person,
-            "readmit": self._incoming.readmit,
+            "person": mapping.person,
+            "given": mapping.given,
+            "pattern": str(incoming.pattern) if incoming.pattern.exists() else "",
+            "patterns": [str(path) for path in sorted(patterns.glob("*.toml"))],
+            "readmit": incoming.readmit,
             "dry": True,
         }
         self._ended = False
         with self._page.show_errors():
-            self._job = self._jobs.start("inspect", spec, self._words("Looking at the files …"))
+            self._job = self._jobs.start(task, spec, self._words("Looking at the files …"))
         self._update()
 
     def _update(self) -> None:
         job = self._job
         if job is None or self._ended:
             return
-        if job.state == RUNNING:
+        running = job.state == RUNNING
+        self._busy.set_visibility(running)
+        self._box.props("inert") if running else self._box.props(remove="inert")
+        if running:
             done, total = job.progress.get("done"), job.progress.get("total")
             text = self._words("Looking at the files …") + (f" {done} / {total}" if total else "")
-            if self._progress is None:
-                self._box.clear()
-                with self._box, ui.row().classes("items-center ps-small-gap").props('role="status"'):
-                    ui.spinner(size="1.2em").props("aria-hidden=true")
-                    self._progress = tag(ui.label(text), "inspecting")
             self._progress.set_text(text)
             return
         self._ended = True
-        self._show(job)
+        self._box.clear()
+        with self._box, tag(ui.column().classes("ps-row w-full ps-small-gap"), "preview"):
+            if "guess" in job.result:
+                self._map(job.result)
+            else:
+                self._show(job)
+
+    def _map(self, result: dict[str, Any]) -> None:
+        """Show how the files of a new sensor are read, with the fields that correct it."""
+        incoming = self._incoming
+        incoming.pattern.unlink(missing_ok=True)
+
+        def accept() -> None:
+            write_file(incoming.pattern, result["guess"]["toml"])
+            self._inspect()
+
+        MappingPanel(self._words, self._mapping, result, lambda: self._inspect("guess"))
+        with ui.row().classes("ps-small-gap"):
+            if result.get("preview", {}).get("rows"):
+                text = self._words("The rows are right: read all files")
+                button("mapping-right", text, on_page(accept), "unelevated color=primary")
+            button("import-cancel", self._words("Cancel"), on_page(self._cancel), "flat")
+        if field := self._mapping.changed:
+            self._mapping.changed = ""
+            ui.run_javascript(f"document.querySelector('[data-test=\"map-{field}\"] input')?.focus()")
 
     def _show(self, job: StudioJob) -> None:
         """Show what the files contain, or why they cannot be imported, with the fields that may mend it."""
-        words, result = self._words, job.result
-        self._progress = None
-        self._box.clear()
-        with self._box, tag(ui.column().classes("ps-row w-full ps-small-gap"), "preview"):
-            reasons = [r["reason"] for r in result.get("rejected", ())]
-            needs = {r["values"].get("needs") for r in (job.refusal, *reasons) if isinstance(r, dict) and r}
-            unknown_person = "person" in needs or UNKNOWN_SUBJECT in result.get("people", ())
-            heading(words("What the files contain"), 3)
-            if job.state == DONE:
-                self._contents(result)
-            elif "person" not in needs:
-                message = words.failure(job.refusal) or words("stopped")
-                tag(notice(message, "error"), "preview-problem")
-            if not result.get("restored"):
-                self._settings(str(result.get("layout", self._layout)), unknown_person, "layout" in needs)
-            if CONSENT in needs:
-                button("import-readmit", words("Take them in anyway"), self._readmit)
-            if job.state == DONE:
-                self._keep_row(result)
-            else:
-                button("import-cancel", words("Cancel"), on_page(self._cancel), "flat")
+        words, result, mapping = self._words, job.result, self._mapping
+        reasons = [r["reason"] for r in result.get("rejected", ())]
+        needs = {r["values"].get("needs") for r in (job.refusal, *reasons) if isinstance(r, dict) and r}
+        unknown_person = "person" in needs or UNKNOWN_SUBJECT in result.get("people", ())
+        heading(words("What the files contain"), 3)
+        if job.state == DONE:
+            if pattern := result["pattern"]:
+                mapping.given["name"] = Path(pattern).stem
+                ui.label(words("Read as the files of “{name}” were.", name=Path(pattern).stem))
+            self._contents(result)
+        elif "person" not in needs:
+            message = words.failure(job.refusal) or words("stopped")
+            tag(notice(message, "error"), "preview-problem")
+        if not result.get("restored"):
+            self._settings(unknown_person, "layout" in needs)
+        if CONSENT in needs:
+            button("import-readmit", words("Take them in anyway"), self._readmit)
+        if job.state == DONE:
+            self._keep_row(result)
+        else:
+            button("import-cancel", words("Cancel"), on_page(self._cancel), "flat")
 
     def _readmit(self) -> None:
         self._incoming.readmit = True
@@ -360,6 +413,7 @@ class IncomingSection:
         rows = [
             (words("People (recordings)"), ", ".join(f"{names.get(p, p)} ({n})" for p, n in people.items())),
             (words("Recordings"), str(result["recordings"])),
+            (words("Sensors"), result["layout"]),
         ]
         facts(rows)
         gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
@@ -372,7 +426,7 @@ class IncomingSection:
         rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result["rejected"]]
         folded_lines(words, words("Files that are not imported: {n}", n=len(rejected)), rejected, "rejected")
 
-    def _settings(self, current: str, unknown_person: bool, unknown_layout: bool) -> None:
+    def _settings(self, unknown_person: bool, unknown_layout: bool) -> None:
         """Add the fields of what the files do not state: the layout, and the person where it is not known."""
         words = self._words
 
@@ -381,23 +435,21 @@ class IncomingSection:
             self._inspect()
 
         def change_person() -> None:
-            if (code := str(person.value or "").strip()) != self._person:
-                self._person = code
+            if (code := str(person.value or "").strip()) != self._mapping.person:
+                self._mapping.person = code
                 self._inspect()
 
-        options = {name: f"{name}: {words(_LAYOUTS.get(name, load_layout(name).title))}" for name in layout_names()}
-        layout = ui.select(options, value=current if current in options else None, label=words("Sensors of the toy"))
-        tag(layout.classes("w-full"), "layout").on_value_change(lambda e: on_page(change_layout)(str(e.value)))
-        layout.props(
-            f'hint="{words("Guessed from the files. Change it if it is wrong.")}"'
-            if current and not self._layout
-            else ""
-        )
-        if unknown_layout:
-            layout.error = words("It is not clear which sensors these files are from. Choose them.")
-        if unknown_person or self._person:
+        if unknown_layout or self._layout:
+            options = {name: f"{name}: {words(_LAYOUTS.get(name, load_layout(name).title))}" for name in layout_names()}
+            layout = ui.select(options, value=self._layout or None, label=words("Sensors of the toy"))
+            tag(layout.classes("w-full"), "layout").on_value_change(lambda e: on_page(change_layout)(str(e.value)))
+            if unknown_layout:
+                layout.error = words("It is not clear which sensors these files are from. Choose them.")
+        if unknown_person or self._mapping.person:
             with ui.row().classes("items-start ps-small-gap w-full"):
-                person = ui.input(words("Code of the person (such as S01)"), value=self._person).classes("ps-wide")
+                person = ui.input(words("Code of the person (such as S01)"), value=self._mapping.person).classes(
+                    "ps-wide"
+                )
                 tag(person, "person-of-files")
                 person.on("keydown.enter", on_page(change_person))
                 button("person-use", words("Use this code"), on_page(change_person))
@@ -423,6 +475,8 @@ class IncomingSection:
         with ui.row().classes("ps-small-gap"):
             text = words("Restore" if result["restored"] else "Import")
             button("import", text, on_page(keep), "unelevated color=primary")
+            if not result["restored"]:
+                button("map-files", words("Change how they are read"), on_page(lambda: self._inspect("guess")), "flat")
             button("import-cancel", words("Cancel"), on_page(self._cancel), "flat")
 
     async def _cancel(self) -> None:
@@ -430,7 +484,8 @@ class IncomingSection:
         self._reset()
 
     def _reset(self) -> None:
-        self._job, self._progress, self._layout, self._person, self._ended = None, None, "", "", True
+        self._job, self._layout, self._mapping, self._ended = None, "", FileMapping(), True
+        self._busy.set_visibility(False)
         self._box.clear()
 
     def _leave(self) -> None:

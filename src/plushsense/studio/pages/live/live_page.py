@@ -8,10 +8,13 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from nicegui import context, run, ui
 
 from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
+from plushsense.core.layouts import layout_names
+from plushsense.dataset.store import DatasetHead
 from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
@@ -34,6 +37,9 @@ _REACTIONS: Texts = {
 }
 
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
+
+
+_MAX_RECORDINGS = 12
 
 
 async def show(page: Page) -> None:
@@ -105,6 +111,25 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
     update()
 
 
+def _recordings(page: Page) -> dict[str, str]:
+    """Return the addresses and names of recordings to play: of sensors that no toy has, a stream or one a gesture."""
+    from plushsense.dataset.index import open_dataset
+
+    found: dict[str, str] = {}
+    for path in page.workspace.datasets():
+        with contextlib.suppress(PlushSenseError, OSError):
+            if DatasetHead.read(path).layout.name in layout_names():
+                continue
+            dataset = open_dataset(path)
+            parts = {r.gesture: (r.file, r.subject, page.words.gesture(r.gesture)) for r in reversed(dataset.used)}
+            streams = [(s.file, s.subject, page.words("stream")) for s in dataset.streams]
+            for file, person, what in (streams or list(parts.values()))[:_MAX_RECORDINGS]:
+                values = {"person": person, "what": what, "dataset": dataset.head.name}
+                title = page.words("Recording of {person}: {what} ({dataset})", **values)
+                found[f"replay://{quote(str(path / file))}"] = title
+    return found
+
+
 class _Controls:
     """Fields for toy, network and settings, which are folded while a toy is read, and the buttons above them."""
 
@@ -113,6 +138,7 @@ class _Controls:
         self._workspace, self._toys = page.workspace, page.workspace.part(Toys)
         words, choice = page.words, reader.choice
         self._state: tuple[Any, ...] = ()
+        self._recordings = _recordings(page)
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._start = button("start", words("Start"), self._begin, "unelevated", icon="play_arrow")
             self._stop = button("stop", words("Stop"), lambda: self._run(reader.stop), "unelevated", icon="stop")
@@ -251,7 +277,9 @@ class _Controls:
             control.set_enabled(not running)
         choice = reader.choice
         now = (
-            f": {toy_title(words, choice.toy)} · {choice.bundle.stem}" if running and choice.bundle is not None else ""
+            f": {self._recordings.get(choice.toy) or toy_title(words, choice.toy)} · {choice.bundle.stem}"
+            if running and choice.bundle is not None
+            else ""
         )
         self._title.set_content(words("Toy, network and settings") + now)
         step_s = reader.bundle.arch.step * reader.bundle.layout.period_us / 1e6 if reader.bundle is not None else 0.05
@@ -280,4 +308,5 @@ class _Controls:
         words, workspace = self._page.words, self._workspace
         known = {one: toy_title(words, one) for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
         found = [d for d in self._toys.listing.devices if d.kind != "virtual"]
-        return known | {d.url: f"{d.name or d.url}: {described(words, d)}" for d in found}
+        known |= {d.url: f"{d.name or d.url}: {described(words, d)}" for d in found}
+        return known | self._recordings
