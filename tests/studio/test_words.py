@@ -154,6 +154,7 @@ def test_a_word_after_a_number_has_its_form(file: Path) -> None:
         "0 ieraksti", "1 ieraksts", "11 ieraksti", "21 ieraksts", "111 ieraksti",
     ]  # fmt: skip
     assert [lv("{n:event} in the log", n=n) for n in (21, 2)] == ["žurnālā 21 notikums", "žurnālā 2 notikumi"]
+    assert lv("{n:event} in the log", n="2–3") == "žurnālā 2–3 notikumi"
     assert lv("{n:,} bytes for each toy", n=12001) == "12\u00a0001 baits vienai rotaļlietai"
     assert lv.form(0.5, ("one", "many")) == lv.form(1.5, ("one", "many")) == "many"
     counts = [

@@ -180,10 +180,13 @@ class _FormFiller(Filler):
         self._words = words
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        if "|" in format_spec:
-            form, number = self._words.form(value, format_spec.split("|")), self._words.count(value)
-            return form.replace("#", number) if "#" in form else f"{number} {form}"
-        return self._words.count(value) if format_spec == "," else super().format_field(value, format_spec)
+        if "|" not in format_spec:
+            return self._words.count(value) if format_spec == "," else super().format_field(value, format_spec)
+        forms = format_spec.split("|")
+        # A number that is a text already, such as “2–3”, has the form of several.
+        number = value if isinstance(value, str) else self._words.count(value)
+        form = forms[-1] if isinstance(value, str) else self._words.form(value, forms)
+        return form.replace("#", number) if "#" in form else f"{number} {form}"
 
 
 class _ValueFiller(_FormFiller):
