@@ -147,6 +147,7 @@ def test_one_wrong_pattern_leaves_no_half_of_a_decision(cli: Cli, folder: Path) 
     assert not (folder / "marks.jsonl").exists()
 
 
+@pytest.mark.exhaustive
 def test_the_page_replaces_its_own_kind_only(cli: Cli, folder: Path, tmp_path: Path) -> None:
     page = tmp_path / "check.html"
     ran = cli("check", folder, "--report", page, "--json")

@@ -147,6 +147,7 @@ def test_labels_of_a_removed_person_go(dataset: Dataset) -> None:
     assert {s.stream for s in open_dataset(dataset.path).stretches} == {P2}
 
 
+@pytest.mark.exhaustive
 def test_the_labels_of_the_example_fit_the_data(real_data: Path, tmp_path: Path) -> None:
     made = import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3").dataset
     file = Path(__file__).parents[2] / "examples" / "makeability-stretches.csv"

@@ -102,6 +102,7 @@ def test_people_of_one_clock_are_not_named_by_the_order_of_their_codes(tmp_path:
     assert max(clock.by_person[p] for p in ("P1", "P2", "P3")) < 0.7
 
 
+@pytest.mark.exhaustive
 def test_across_sessions_the_way_of_holding_does_not_help(tmp_path: Path) -> None:
     dataset = people(tmp_path, style=0.0, hold=4000.0, sessions=2)
     assert {r.session for r in dataset.recordings} == {"s0", "s1"}

@@ -153,7 +153,9 @@ SLOWEST = ("evaluate", "sweep", "publish")
 @pytest.mark.parametrize(
     ("name", "fault"), [(n, f) for n in DRILLS for f in ("kill", "full") if LONG or f == "kill" or n not in SLOWEST]
 )
-@pytest.mark.exhaustive_for("adapt-full-0", "backup-full-0", "check-full-0", "export-full-0", "forget-full-0")
+@pytest.mark.exhaustive_for(
+    "adapt-full-0", "backup-full-0", "check-full-0", "export-full-0", "forget-full-0", "publish-kill-0", "export-kill-0"
+)
 def test_given_again_it_does_what_it_does_undisturbed(
     name: str, fault: Fault, repetition: int, base: Path, undisturbed: Callable[[str], Any], tmp_path: Path
 ) -> None:

@@ -483,12 +483,19 @@ def test_one_button_makes_a_network_that_a_stop_does_not_lose(studio: Fixture, l
     button = marked(page, "make")
     button.wait_for()
     assert page.evaluate("(b) => b.getBoundingClientRect().bottom <= innerHeight", button.element_handle())
+    page.evaluate(
+        "() => { const draw = CanvasRenderingContext2D.prototype.fillText; window.drawn = new Set();"
+        " CanvasRenderingContext2D.prototype.fillText = function (text, ...at) { window.drawn.add(String(text));"
+        " draw.call(this, text, ...at); }; }"
+    )
     button.click()
     # While the network is tested, it is saved already.
     page.wait_for_function(
         "() => document.querySelector('[data-test=at]')?.textContent.includes('pārbauda ar svešiem cilvēkiem')",
         timeout=LONG_MS,
     )
+    numbers = [text for text in page.evaluate("() => [...window.drawn]") if re.fullmatch(r"[0-9.,]+", text)]
+    assert any("," in text for text in numbers) and not any("." in text for text in numbers)
     marked(page, "stop").click()
     stopped = state(page, "stopped")
     network = few / "bundles" / "virtual toy.plush"

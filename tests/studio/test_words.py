@@ -77,8 +77,7 @@ def source() -> Source:
                 found.texts.update(dict.fromkeys((t for v in node.value.values for t in texts_of(v)), place))
             elif isinstance(node, ast.Call):
                 name = getattr(node.func, "id", getattr(node.func, "attr", ""))
-                counted = name == "plural" and isinstance(node.func, ast.Attribute)
-                if counted or name in TRANSLATORS or name in ("each", "PageTexts"):
+                if name in TRANSLATORS or name in ("each", "PageTexts"):
                     given = [k.value for k in node.keywords] if name == "PageTexts" else node.args
                     given = given if name in ("each", "PageTexts") else given[:1]
                     found.texts.update(dict.fromkeys((t for v in given for t in texts_of(v)), place))
@@ -144,7 +143,23 @@ def test_a_text_without_a_translation_is_in_english() -> None:
     assert Words("lv")("Hello, {name}", name="A") == "Hello, A"
     assert Words("lv")(in_context("of a door", "Open")) == "Open"
     assert Words("xx")("Home") == "Home" and Words("lv")("Home") == "Sākums"
-    assert Words("lv").plural("{n} thing", "{n} things", 21) == "21 things"
+    assert Words("lv")("{n:thing}", n=21) == "21 things"
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_word_after_a_number_has_its_form(file: Path) -> None:
+    """Also 21 and 101 are singular in Latvian, 11 and 111 are not; both forms are there wherever a word changes."""
+    lv = Words("lv")
+    assert [lv("{n:recording}", n=n) for n in (0, 1, 11, 21, 111)] == [
+        "0 ieraksti", "1 ieraksts", "11 ieraksti", "21 ieraksts", "111 ieraksti",
+    ]  # fmt: skip
+    assert [lv("{n:event} in the log", n=n) for n in (21, 2)] == ["žurnālā 21 notikums", "žurnālā 2 notikumi"]
+    assert lv("{n:,} bytes for each toy", n=12001) == "12\u00a0001 baits vienai rotaļlietai"
+    assert lv.form(0.5, ("one", "many")) == lv.form(1.5, ("one", "many")) == "many"
+    counts = [
+        spec for m in messages(file) for _, _, spec, _ in string.Formatter().parse(m.string) if "|" in (spec or "")
+    ]
+    assert (len(counts) > 30) == (file.stem == "lv") and all(spec.count("|") == 1 for spec in counts)
 
 
 def test_an_error_is_in_the_language_of_the_page() -> None:

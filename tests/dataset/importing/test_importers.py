@@ -209,6 +209,7 @@ def test_makeability_imports_whole(imported_study: Any) -> None:
     assert all(r.stream_row >= 0 for r in with_stream)
 
 
+@pytest.mark.exhaustive
 def test_har_phone_imports_whole(real_data: Path, tmp_path: Path) -> None:
     done = import_recordings(real_data / "har-phone", tmp_path / "DS", layout="phone-6")
     assert done.subjects == 23

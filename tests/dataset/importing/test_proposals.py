@@ -244,6 +244,7 @@ def test_rate_gap_and_window_are_measured(tmp_path: Path) -> None:
     assert (adopted.rate_hz, adopted.gap_ms) == (12.0, found["gap_ms"])
 
 
+@pytest.mark.exhaustive
 def test_the_real_recordings_need_nothing_but_a_window(real_data: Path, tmp_path: Path) -> None:
     for source, layout in (("makeability-gestures", "accel-3"), ("har-phone", "phone-6")):
         done = import_recordings(real_data / source, tmp_path / layout)

@@ -64,7 +64,7 @@ def score_text(words: Words, mean: float | None, sd: float | None) -> str:
 
 def counted(words: Words, kind: str, n: int) -> str:
     """Return a number with its noun in the right form, such as 5 folds, or 21 cilvēks."""
-    return words.plural(*_COUNTS[kind], n)
+    return words(_COUNTS[kind], n=n)
 
 
 def duration_text(words: Words, seconds: float) -> str:
@@ -113,17 +113,17 @@ EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
 PERSONAL = "personal"
 """Split of a network that is adapted to a person: nothing was tested on others."""
 SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
-_COUNTS = {
-    "people": ("{n} person", "{n} people"),
-    "with_people": (in_context("dative", "{n} person"), "{n} people"),
-    "more_people": ("{n} more person", "{n} more people"),
-    "recordings": ("{n} recording", "{n} recordings"),
-    "gestures": ("{n} gesture", "{n} gestures"),
-    "folds": ("{n} fold", "{n} folds"),
-    "trainings": ("{n} training", "{n} trainings"),
-    "networks": ("{n} network", "{n} networks"),
-    "epochs": ("{n} epoch", "{n} epochs"),
-    "minutes": ("{n} minute", "{n} minutes"),
+_COUNTS: Texts = {
+    "people": "{n:person}",
+    "with_people": in_context("dative", "{n:person}"),
+    "more_people": "{n:more person}",
+    "recordings": "{n:recording}",
+    "gestures": "{n:gesture}",
+    "folds": "{n:fold}",
+    "trainings": "{n:training}",
+    "networks": "{n:network}",
+    "epochs": "{n:epoch}",
+    "minutes": "{n:minute}",
 }
 _UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK: "people"}
 _HASH = 6

@@ -1,4 +1,8 @@
-"""Translate the texts of the pages, which the source has in English; see ``locale/<language>.po`` of the studio."""
+"""Translate the texts of the pages, which the source has in English; see ``locale/<language>.po`` of the studio.
+
+A translation names the forms that a word has after a number: ``{n:rinda|rindas}`` becomes *21 rinda*, *12 rindas*, and
+``{n:atlikta # rinda|atliktas # rindas}`` has the number within. The English texts count as `Filler` does: ``{n:row}``.
+"""
 
 from __future__ import annotations
 
@@ -78,22 +82,20 @@ class Words:
 
     def __call__(self, text: str, /, **values: Any) -> str:
         translated = str(self._translation(text) or text.rpartition(_CONTEXT)[2])
-        return translated.format(**values) if values else translated
+        return _FormFiller(self).vformat(translated, (), values) if values else translated
 
     def each(self, *texts: str) -> list[str]:
         """Return the translations of several texts, such as the headings of a table."""
         return [self(text) for text in texts]
 
-    def plural(self, one: str, many: str, n: int) -> str:
-        """Return the text for a number, which replaces ``{n}``, in the form that the language has for it."""
-        forms = self._translation(one)
-        form = forms[self._plural_form(n)] if isinstance(forms, tuple) else many if n != 1 else one
-        return form.rpartition(_CONTEXT)[2].format(n=n)
+    def form(self, n: float, forms: Sequence[str]) -> str:
+        """Return the form that goes with a number: that of 1 (in Latvian also of 21), or that of several."""
+        return forms[self._plural_form(int(n))] if n == int(n) else forms[-1]
 
-    def _translation(self, text: str) -> str | tuple[str, ...]:
+    def _translation(self, text: str) -> str:
         context, _, text = text.rpartition(_CONTEXT)
         message = self._catalog.get(text, context or None)
-        return message.string if message is not None else ""  # type: ignore[return-value]
+        return str(message.string) if message is not None else ""
 
     def number(self, value: float, digits: int = 0) -> str:
         """Format a number with the decimal separator of this language."""
@@ -173,11 +175,21 @@ def _has_message(value: object) -> bool:
     return isinstance(value, Message) or (isinstance(value, list | tuple) and any(map(_has_message, value)))
 
 
-class _ValueFiller(Filler):
-    """Fill values of a `Message` into its translation, in the form that the language has for them."""
+class _FormFiller(Filler):
+    """Fill values into a translation, with the form of a word that its language has for a number."""
 
     def __init__(self, words: Words) -> None:
         self._words = words
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if "|" in format_spec:
+            form, number = self._words.form(value, format_spec.split("|")), self._words.count(value)
+            return form.replace("#", number) if "#" in form else f"{number} {form}"
+        return self._words.count(value) if format_spec == "," else super().format_field(value, format_spec)
+
+
+class _ValueFiller(_FormFiller):
+    """Fill values of a `Message` into its translation, as the language has them."""
 
     def get_value(self, key: int | str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         return self._worded(str(key), kwargs[str(key)])
@@ -197,7 +209,7 @@ class _ValueFiller(Filler):
         return words.gesture(str(value)) if key in ("gesture", "gestures") else value
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        if isinstance(value, float):
+        if isinstance(value, float) and "|" not in format_spec:
             return format(value, format_spec or ".10g").replace(".", self._words.decimal_point)
         return super().format_field(value, format_spec)
 

@@ -45,7 +45,9 @@ export default {
       const off = this.u ? this.u.series.map((s) => s.show) : null;
       this.u?.destroy();
       const ink = colour("--ps-ink"), grid = { stroke: colour("--ps-line"), width: 1 };
-      const axis = (title, size) => ({ stroke: ink, grid, ticks: grid, label: title || undefined, labelSize: 22, size });
+      const number = new Intl.NumberFormat(document.documentElement.lang || "en", { maximumFractionDigits: 4 });
+      const values = (u, splits) => splits.map((v) => (v == null ? "" : number.format(v)));
+      const axis = (title, size) => ({ values, stroke: ink, grid, ticks: grid, label: title || undefined, labelSize: 22, size });
       const options = {
         width: this.$el.clientWidth || 600,
         height: this.height,

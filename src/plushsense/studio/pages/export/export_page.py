@@ -162,12 +162,12 @@ def _list_facts(words: Words, export: ExportFacts, model: ModelFacts) -> None:
             (words("Sensors"), model.layout),
             (
                 words("Flash for the network"),
-                words("{n} bytes, without the code; see the cost below", n=words.count(model.flash_bytes)),
+                words("{n:,} bytes, without the code; see the cost below", n=model.flash_bytes),
             ),
-            (words("RAM"), words("{n} bytes for each toy", n=words.count(model.ram_bytes))),
+            (words("RAM"), words("{n:,} bytes for each toy", n=model.ram_bytes)),
             (
                 words("A step"),
-                words("every {ms} ms, {macs} multiplications", ms=step, macs=words.count(model.macs_per_step)),
+                words("every {ms} ms, {macs:,} multiplications", ms=step, macs=model.macs_per_step),
             ),
             (words("Created"), moment(export.made_s)),
             (words("Folder"), str(export.folder)),
@@ -175,7 +175,7 @@ def _list_facts(words: Words, export: ExportFacts, model: ModelFacts) -> None:
     )
     for name, each in model.conversions.items():
         apart = each.largest_difference
-        message = words("{name}: {file}, {n} bytes.", file=each.file, n=words.count(each.bytes), name=name)
+        message = words("{name}: {file}, {n:,} bytes.", file=each.file, n=each.bytes, name=name)
         if apart is not None:
             difference = words.significant(apart, 1)
             message += f" {words('Its outputs differ by up to {d} from those of the trained network.', d=difference)}"
@@ -320,14 +320,14 @@ class VerificationCard:
                 text(words("Not run: {what} ({why}).", what=each["what"], why=why), classes="ps-dim")
 
     def _sum(self, result: dict[str, Any]) -> str:
-        total, unequal = self.words.count(result["vectors"]), self.words.count(result["mismatches"])
-        if not result["mismatches"]:
+        total, unequal = result["vectors"], result["mismatches"]
+        if not unequal:
             return self.words(
-                "All {n} answers of {settings} programs are equal to the exact network's.",
+                "All {n:,} answers of {settings:program} are equal to the exact network's.",
                 n=total,
                 settings=len(result["runs"]),
             )
-        return self.words("{bad} of {n} answers differ.", bad=unequal, n=total)
+        return self.words("{bad:,} of {n:,} answers differ.", bad=unequal, n=total)
 
     def _sentences(self, result: dict[str, Any]) -> list[str]:
         words, sentences = self.words, []

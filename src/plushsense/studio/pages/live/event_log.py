@@ -123,7 +123,7 @@ class LogButtons:
 
     def _update(self) -> None:
         n = len(self._events())
-        self._count.set_text(self._page.words.plural("{n} event in the log", "{n} events in the log", n))
+        self._count.set_text(self._page.words("{n:event} in the log", n=n))
         for control in (self._save, self._print):
             control.set_enabled(n > 0)
 
