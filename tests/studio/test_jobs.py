@@ -268,14 +268,15 @@ def test_a_worker_that_is_asked_nonsense_refuses(line: str) -> None:
 
 
 def test_a_person_to_remove_is_not_stored_in_the_work_folder(workspace: Workspace, jobs: Jobs) -> None:
-    job = ended(jobs.start("forget", {"dataset": str(workspace.folder), "person": "Annabelle"}, "Remove"))
-    assert job.state == REFUSED and job.spec["person"] == "Annabelle"
+    spec = {"home": str(workspace.folder), "given": [], "chosen": ["sessions Annabelle"], "person": "Annabelle"}
+    job = ended(jobs.start("forget", spec, "Remove"))
+    assert job.state == DONE and job.result["receipt"]["person"] == "Annabelle"
     assert not [p for p in workspace.folder.rglob("*") if p.is_file() and "Annabelle" in p.read_text(encoding="utf-8")]
     # A studio that was started again does not know the person any more.
     again = ended(Jobs(workspace).resume(job.id))
     assert (again.state, again.message) == (
         REFUSED,
-        "The person's code is not stored. Choose the person again in the menu of the data set.",
+        "The person's code is not stored. Choose the person again on the home page.",
     )
 
 

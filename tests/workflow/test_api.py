@@ -16,7 +16,7 @@ from plushsense.core.errors import ConfigError, DatasetError, PlushSenseWarning
 from plushsense.dataset.store import Dataset
 from plushsense.models.bundle import trained_people
 from plushsense.workflow.api import simulate, validation_predictions
-from plushsense.workflow.datasets import trained_on
+from plushsense.workflow.forgetting import trained_on
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people
 from support.small_dataset import Cli

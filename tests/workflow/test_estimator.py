@@ -405,7 +405,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
 
 
 def test_forget_finds_a_classifier_that_was_told_whose_windows_they_are(dataset: Dataset, tmp_path: Path) -> None:
-    from plushsense.workflow.datasets import trained_on
+    from plushsense.workflow.forgetting import trained_on
 
     windows = ps.cut_windows(dataset)
     model = ps.PlushClassifier(filters=(2, 2, 2), epochs=1, layout="accel-3")

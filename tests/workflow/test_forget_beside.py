@@ -17,12 +17,14 @@ from plushsense.core.errors import ForgottenError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import forget
+from plushsense.dataset.privacy.removed import RemovedCodes
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.adaptation import evaluate_adapting
 from plushsense.experiments.baselines.run_baselines import ComparisonSpec, baselines
 from plushsense.experiments.streams.benchmark import BenchmarkSpec, stream_benchmark
 from plushsense.workflow.api import unfinished
 from plushsense.workflow.datasets import PublishSpec, share_copy
+from plushsense.workflow.forgetting import find_traces, forget_everywhere, people_of_home
 from support.sweeping import sweep
 
 pytestmark = pytest.mark.apart("trainings")
@@ -237,6 +239,17 @@ def test_no_byte_of_the_person_is_left_that_is_not_listed(
     shutil.copytree(home / "datasets" / ".DS-unfinished-1", scratch / ".plushsense-unfinished-1")
     before = {where.split("/")[0] for where in bytes_of(home)}
     assert {"backups", "bundles", "copy", "datasets", "discarded", "key.csv", "work"} - before == {"copy"}
+    copied = Path(shutil.copytree(home, home.with_name("everywhere")))
+    found = find_traces(copied, PERSON)
+    kinds = ["dataset", "dataset", "network", "backup", "key", "folder", "folder", "notes", "notes"]
+    assert [trace.kind for trace in found.traces] == kinds
+    assert people_of_home(copied) == sorted({"P1", "P3", "P4", "P5", PERSON, *open_dataset(copied / "copy").subjects})
+    receipt = forget_everywhere(copied, PERSON, [trace.id for trace in found.traces])
+    assert receipt.removed == found.traces and (receipt.kept, receipt.failed) == ((), ())
+    left = {copied / where for where in bytes_of(copied)}
+    assert left == set(receipt.found.mentions) and PERSON in json.dumps(receipt.to_json())
+    assert len(open_dataset(copied / "copy").subjects) == 4 and found.pseudonyms
+    assert PERSON in RemovedCodes.read(copied) and not find_traces(copied, PERSON).traces
     done = cli("forget", dataset, PERSON, "--yes", "--json").json
     listed = [dataset / at for at in done["mentions"]] + [Path(b["bundle"]) for b in done["bundles"]]
     listed += map(Path, (*done["discarded"], *done["elsewhere"]))

@@ -11,7 +11,7 @@ import pytest
 
 import plushsense as ps
 from plushsense.dataset.store import Dataset
-from plushsense.workflow.datasets import forget
+from plushsense.workflow.forgetting import forget
 
 pytestmark = pytest.mark.apart("trainings")
 

@@ -50,7 +50,9 @@ def _restore(args: argparse.Namespace) -> int:
     if not args.dataset or args.file:
         raise ConfigError("Give the backup and one new folder:  plushsense backup --restore FILE.zip DATASET")
     limits = UnpackLimits.of_gigabytes(args.max_gb)
-    dataset = restore(args.restore, args.dataset, progress=ProgressReporter("restoring"), limits=limits)
+    dataset = restore(
+        args.restore, args.dataset, progress=ProgressReporter("restoring"), limits=limits, readmit=args.readmit
+    )
     counts = {"recordings": len(dataset.recordings), "subjects": len(dataset.subjects)}
     result = {"dataset": args.dataset, **counts, "streams": len(dataset.streams), "hash": dataset.hash}
     people = plural(counts["subjects"], "person")

@@ -10,13 +10,13 @@ from plushsense.cli.output import emit, say
 from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
-    from plushsense.workflow.datasets import Forgotten
+    from plushsense.workflow.forgetting import Forgotten
 
 _MOST_FILES = 10
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.workflow.datasets import forget
+    from plushsense.workflow.forgetting import forget
 
     result = forget(args.dataset, args.subject, bundles=args.bundles)
     confirmed = args.yes or (not args.json and sys.stdin.isatty() and _confirm(result, args.subject))

@@ -115,6 +115,7 @@ def run(args: argparse.Namespace) -> int:
         progress=ProgressReporter("reading"),
         add_to=args.add,
         adopt_proposals=args.adopt,
+        readmit=args.readmit,
     )
     if not args.json:
         _report(done, f"; all are in {args.dest}/*.csv")

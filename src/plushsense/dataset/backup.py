@@ -22,7 +22,8 @@ from plushsense.core.toml import load_table
 from plushsense.dataset.files import list_files
 from plushsense.dataset.importing.archives import DAMAGED, UnpackLimits, member_target, refusal, zip_entry
 from plushsense.dataset.index import open_dataset, rebuild_index
-from plushsense.dataset.store import HEAD, Dataset, Progress
+from plushsense.dataset.privacy.removed import refuse_removed
+from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, Dataset, Progress
 
 MANIFEST = "plushsense-backup.json"
 FORMAT = "plushsense-backup"
@@ -209,21 +210,39 @@ def is_backup(file: str | Path) -> bool:
         return False
 
 
+def backup_people(file: str | Path) -> list[str]:
+    """Return the people of whom a backup has recordings or streams, by its manifest."""
+    with _open_backup(Path(file)) as (_, manifest):
+        return _people_of(manifest)
+
+
+def _people_of(manifest: Manifest) -> list[str]:
+    paths = [file.path.split("/") for file in manifest.files]
+    return sorted({parts[1] for parts in paths if len(parts) > 2 and parts[0] in (RECORDINGS, STREAMS)})
+
+
 def restore(
-    file: str | Path, dest: str | Path, progress: Progress | None = None, limits: UnpackLimits | None = None
+    file: str | Path,
+    dest: str | Path,
+    progress: Progress | None = None,
+    limits: UnpackLimits | None = None,
+    readmit: bool = False,
 ) -> Dataset:
     """Restore a data set into a new or empty folder, completely or not at all.
 
     Args:
         limits: limits of the number of files and of their size; the expansion ratio is not limited.
+        readmit: whether to restore people who were removed from the home that ``dest`` lies in.
 
     Raises:
-        DatasetError: for a damaged backup, for one with paths outside of ``dest`` or beyond the ``limits``, or if
-            ``dest`` is not empty.
+        DatasetError: for a damaged backup, for one with paths outside of ``dest`` or beyond the ``limits``, if
+            ``dest`` is not empty, or for removed people.
     """
     path, folder = Path(file), Path(dest)
     with _open_backup(path) as (archive, manifest):
         (limits or UnpackLimits()).check(path, len(manifest.files), manifest.bytes, folder)
+        if not readmit:
+            refuse_removed(folder, _people_of(manifest))
         done = 0
         with new_folder(folder, DatasetError, last=HEAD) as work:
             for entry in manifest.files:

@@ -30,7 +30,6 @@ from plushsense.dataset.backup import backup, is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings, propose
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.publishing.checking import validate_package
 from plushsense.dataset.store import HEAD
 from plushsense.deploy.profile import profile
@@ -44,6 +43,7 @@ from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings, from_stored
 from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
 from plushsense.workflow.export import export
+from plushsense.workflow.forgetting import forget_everywhere
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people, refits
 from plushsense.workflow.reporting import check_folder, load_evaluation
@@ -119,7 +119,9 @@ def _import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """
     settings: dict[str, Any] = {"add_to": True} if spec.get("add") else {"name": spec.get("name") or None}
     with _collected(spec) as source:
-        done = import_recordings(source, spec["dest"], progress=reporter.count, **settings)
+        done = import_recordings(
+            source, spec["dest"], progress=reporter.count, readmit=spec.get("readmit", False), **settings
+        )
     stored = done.to_json()
     result = {key: stored[key] for key in ("recordings", "subjects", "added", "rejected")}
     return {**result, "dataset": str(spec["dest"]), "warnings": list(done.notes), "flagged": len(done.warnings)}
@@ -158,9 +160,10 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     rejected: list[dict[str, str]] = []
     refusals: list[PlushSenseError] = []
     restored = len(sources) == 1 and is_backup(sources[0])
+    readmit = bool(spec.get("readmit"))
     flagged = 0
     if restored:
-        restore(sources[0], dest, progress=reporter.count)
+        restore(sources[0], dest, progress=reporter.count, readmit=readmit)
         sources = []
     for source in sources:
         adding = dest.exists()
@@ -174,6 +177,7 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
                 guess_layout=not adding,
                 # What a single source proves may not fit the others.
                 adopt_proposals=len(sources) == 1 and not adding,
+                readmit=readmit,
                 limits=UNPACKED,
                 progress=reporter.count,
                 **settings,
@@ -230,20 +234,24 @@ def _restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Restore the backup ``file`` as the new data set ``dest`` with the name ``name``."""
     # One of the studio's own backups: only the disk limits it.
     limits = UnpackLimits(max(1, shutil.disk_usage(Path(spec["file"]).parent).free), files=1 << 30)
-    dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits)
+    readmit = bool(spec.get("readmit"))
+    dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits, readmit=readmit)
     write_file(dataset.path / HEAD, replace(dataset.head, name=spec["name"]).to_toml())
     return {"dataset": str(spec["dest"]), "recordings": len(dataset.recordings), "people": len(dataset.subjects)}
 
 
 def _forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Remove ``person`` from ``dataset``; the result does not name the person.
+    """Remove what is ``chosen`` of the traces of ``person`` in ``home`` and in the data sets ``given``.
 
     Raises:
         ConfigError: if ``person`` is missing, as in a job resumed after a restart, because it is never stored.
     """
     if "person" not in spec:
-        raise ConfigError("The person's code is not stored. Choose the person again in the menu of the data set.")
-    return {"dataset": spec["dataset"], "files": len(forget(spec["dataset"], spec["person"]).files)}
+        raise ConfigError("The person's code is not stored. Choose the person again on the home page.")
+    given = [Path(path) for path in spec["given"]]
+    done = forget_everywhere(Path(spec["home"]), spec["person"], spec["chosen"], given)
+    left = len(done.kept) + len(done.failed) + len(done.found.mentions)
+    return {"removed": len(done.removed), "left": left, "receipt": done.to_json()}
 
 
 def _publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:

@@ -1,23 +1,21 @@
-"""Check a data set, mark decisions, publish it, and remove people from it."""
+"""Check a data set, mark decisions, and publish it."""
 
 from __future__ import annotations
 
-import glob
 import html
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from filelock import FileLock
 
-from plushsense.core.errors import BundleError, ConfigError, DatasetError
+from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.sentences import Message, plural
-from plushsense.dataset.index import as_dataset, change_head, open_dataset
-from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
-from plushsense.dataset.privacy.forget import forget as remove_person
+from plushsense.dataset.files import change_head
+from plushsense.dataset.index import as_dataset
 from plushsense.dataset.publishing.checking import StageProgress
 from plushsense.dataset.publishing.contents import ContentsSpec, person_codes, public_codes, public_labels
 from plushsense.dataset.publishing.keys import open_key
@@ -35,16 +33,14 @@ from plushsense.dataset.publishing.package import (
 from plushsense.dataset.quality import checking
 from plushsense.dataset.quality.checking import CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits
-from plushsense.dataset.store import Dataset, DatasetHead, Progress
+from plushsense.dataset.store import Dataset, Progress
 from plushsense.evaluation.reidentification import reidentify, report, verdict
-from plushsense.models.bundle import Bundle, is_training_content
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Largest number of findings that a notebook displays.
 _MOST_FINDINGS = 50
-SUFFIX = ".plush"
 
 
 @dataclass(frozen=True)
@@ -276,136 +272,3 @@ def _contents_of(dataset: Dataset, out: Path, spec: PublishSpec) -> Iterator[Con
             with dataset.generation.writing():
                 key.write(path)
         yield replace(contents, key=key)
-
-
-@dataclass(frozen=True)
-class TrainedOn:
-    """A bundle that was, or may have been, trained on a person; ``certain`` if its data set had the same content."""
-
-    bundle: str
-    certain: bool
-    message: str
-
-
-@dataclass(frozen=True)
-class Forgotten:
-    """The files that were removed from a data set (``done``) or would be, and what else holds the person's data.
-
-    ``bundles`` were trained on the person; ``discarded`` are folders of recordings that were discarded in the studio.
-    ``elsewhere`` are other files and folders in the same places that contain the code or cannot be read.
-    """
-
-    plan: RemovalPlan
-    bundles: list[TrainedOn]
-    done: bool
-    dataset: str
-    discarded: list[str] = field(default_factory=list)
-    elsewhere: list[str] = field(default_factory=list)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON."""
-        return {
-            "dataset": self.dataset,
-            "done": self.done,
-            **asdict(self.plan),
-            "bundles": [vars(b) for b in self.bundles],
-            "discarded": self.discarded,
-            "elsewhere": self.elsewhere,
-        }
-
-
-def forget(
-    dataset: str | os.PathLike[str],
-    subject: str,
-    *,
-    confirm: bool = False,
-    bundles: Iterable[str | os.PathLike[str]] = (),
-) -> Forgotten:
-    """Remove a person from a data set permanently; without ``confirm``, only list what would be removed.
-
-    Args:
-        bundles: folders or files to search for models trained on the person, for corrections of the person, for
-            recordings discarded in the studio and for anything else that contains the code, besides the data set's
-            folder and the studio's folder that it lies in. They are only listed; the user must train the models again,
-            and delete the old ones and the rest.
-
-    Raises:
-        DatasetError: when the person is not in the data set.
-    """
-    folder = Path(dataset)
-    plan = plan_removal(folder, subject)
-    bundles = list(bundles)
-    places = [folder, *map(Path, bundles)]
-    trained = trained_on(folder, subject, places)
-    homes = {place.resolve() for place in [*places, folder.resolve().parent.parent]}
-    code = glob.escape(subject)
-    patterns = (f"recordings/{code}", f"datasets/*/recordings/{code}")
-    discarded = sorted(str(p) for home in homes for pattern in patterns for p in (home / "discarded").glob(pattern))
-    inside = folder.resolve()
-    studio = [inside.parent.parent] if inside.parent.name == "datasets" else []
-    searched = dict.fromkeys(place for p in bundles if (place := Path(p).resolve()).is_dir() and place not in studio)
-    listed = {Path(path).resolve() for path in (*discarded, *(b.bundle for b in trained))}
-    found = find_mentions([*studio, *searched], subject, inside)
-    elsewhere = sorted({str(p) for p in found if not listed & {p.resolve(), *p.resolve().parents}})
-    if confirm:
-        plan = remove_person(folder, subject)
-    return Forgotten(plan, trained, confirm, str(folder), discarded, elsewhere)
-
-
-def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[TrainedOn]:
-    """Find the bundles in ``places`` that were trained, validated or adapted on the person.
-
-    Bundles that cannot be read, and exports of this data set, are listed too, because they may depend on the person.
-    """
-    name = DatasetHead.read(folder).name
-    dataset: Dataset | None
-    try:
-        dataset = open_dataset(folder)
-    except DatasetError:
-        # After an interrupted removal, only the name can be compared.
-        dataset = None
-    entries = []
-    for path in _bundles(places):
-        try:
-            message, certain = _training_of(Bundle.load(path), subject, name, dataset)
-        except BundleError as error:
-            message, certain = f"cannot be read, so its training people are unknown: {error}", False
-        if message:
-            entries.append(TrainedOn(str(path), certain, message))
-    return entries
-
-
-def _training_of(bundle: Bundle, subject: str, name: str, dataset: Dataset | None) -> tuple[str, bool]:
-    """Return how a bundle depends on a person ("" if not), and whether that is certain; ``dataset`` if it opens."""
-    provenance = bundle.provenance
-    same_content = dataset is not None and is_training_content(bundle, dataset)
-    same_name = provenance.get("dataset") == name
-    people = [provenance.get(key, ()) for key in ("subjects", "validation_subjects")]
-    if any(isinstance(each, int) for each in people):
-        # An export states the number of people, not their codes.
-        export = "belongs to an export of this data set, which does not name people: check the bundle it was made from"
-        return (export if same_content or same_name else ""), False
-    if subject not in {code for each in people for code in each}:
-        adapted = "adapted to this code: remove it, or undo that with  plushsense adapt BUNDLE --undo"
-        return (adapted if bundle.adapted_to == subject else ""), False
-    if same_content:
-        return "trained on this person: train it again without them, and remove it", True
-    if same_name:
-        return "trained on this code in an earlier state of this data set: train it again, and remove it", False
-    return (
-        f"trained on this code in the data set '{provenance.get('dataset', '?')}': check whether it is the same person",
-        False,
-    )
-
-
-def _bundles(places: Iterable[Path]) -> list[Path]:
-    paths: dict[Path, Path] = {}
-    for place in places:
-        if not place.exists():
-            raise DatasetError(f"There is no folder '{place}' to search for bundles: check the path.")
-        found = ((at, name) for at, _, names in os.walk(place) for name in names)
-        inside = [Path(at) / name for at, name in found if name.lower().endswith(SUFFIX)]
-        files = [place] if place.is_file() else inside
-        for path in sorted(files):
-            paths.setdefault(path.resolve(), path)
-    return list(paths.values())

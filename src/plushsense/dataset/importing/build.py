@@ -50,8 +50,9 @@ from plushsense.dataset.index import (
     rebuild_index,
     write_index_files,
 )
-from plushsense.dataset.marks import Mark, MarkState, adding_locked, append_marks, read_marks, write_marks
+from plushsense.dataset.marks import RECORDER, Mark, MarkState, adding_locked, append_marks, read_marks, write_marks
 from plushsense.dataset.privacy.forget import read_removals
+from plushsense.dataset.privacy.removed import remembers_removed
 from plushsense.dataset.store import (
     HEAD,
     RECORDINGS,
@@ -68,7 +69,6 @@ from plushsense.dataset.store import (
 )
 from plushsense.recording.writer import SESSION_LOG
 
-RECORDER = "recorder"
 TWICE = Message("the same file was already imported")
 # Files to which the recorder only appends.
 APPENDED = (STREAM_NAME, SESSION_LOG)
@@ -601,7 +601,8 @@ def _move_files(files: ImportedFiles, dest: Path) -> None:
 def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
     """Return a warning if ``come`` were added to a data set from which people were removed: they may be the same."""
     gone = read_removals(dest)
-    if not come or not gone:
+    # A home remembers who was removed, so that whoever came now is another person or was asked about.
+    if not come or not gone or remembers_removed(dest):
         return []
     days = ", ".join(dict.fromkeys(g.day for g in gone))
     listed = join_names(come, most=5)

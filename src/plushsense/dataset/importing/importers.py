@@ -27,8 +27,9 @@ from plushsense.dataset.importing.pattern import ImportPattern, read_pattern
 from plushsense.dataset.importing.proposals import SELF_CALIBRATION, Proposal, adopt, find_sensors, propose_settings
 from plushsense.dataset.importing.results import FileReason, ImportPreview, ImportResult, PreviewRow, group_flags
 from plushsense.dataset.importing.scanning import scan_source
-from plushsense.dataset.importing.sources import LEFT_OUT, ScanSpec, SourceFile, SourceScan, read_mapping
+from plushsense.dataset.importing.sources import LEFT_OUT, ScanSpec, SourceFile, SourceScan, folder_name, read_mapping
 from plushsense.dataset.index import rebuild_index
+from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.dataset.quality.measurements import Examination
 from plushsense.dataset.quality.recordings import clock_still
 from plushsense.dataset.store import (
@@ -89,6 +90,7 @@ class ImportSettings(ScanSettings, total=False):
         people: the path of a people's table, see `dataset.store.read_people`.
         adopt_proposals: whether the layout of a new data set takes what its recordings prove (see `propose_settings`):
             rate, gap, offsets, units, valid ranges, self-calibration. Everything else is only reported.
+        readmit: whether to take in people who were removed from the home that the data set lies in.
     """
 
     name: str | None
@@ -97,6 +99,7 @@ class ImportSettings(ScanSettings, total=False):
     simulated: bool
     people: str | Path | None
     adopt_proposals: bool | None
+    readmit: bool
 
 
 @contextmanager
@@ -242,12 +245,19 @@ def _read_people(settings: ImportSettings) -> Mapping[str, PersonInfo]:
     return {} if people is None else read_people(Path(people))
 
 
+def _admitted(scan: SourceScan, dest: Path, settings: ImportSettings) -> SourceScan:
+    """Return the scan; raise DatasetError if it has people who were removed from the home of ``dest``."""
+    if not settings.get("readmit"):
+        refuse_removed(dest, {folder_name(file.subject) for file in scan.found if file.kind})
+    return scan
+
+
 def _create(
     source: Path, dest: Path, spec: ScanSpec, settings: ImportSettings, progress: Progress | None
 ) -> ImportResult:
     """Create a data set from a source."""
     people = _read_people(settings)
-    scan = scan_source(source, spec)
+    scan = _admitted(scan_source(source, spec), dest, settings)
     head = DatasetHead(
         name=settings.get("name") or (source.resolve().name if source.is_dir() else source.stem),
         layout=scan.layout,
@@ -274,7 +284,7 @@ def _add(source: Path, dest: Path, spec: ScanSpec, settings: ImportSettings, pro
     # An inferred set cannot decide which markers of an XDF file are gestures.
     of_set = spec.gestures if head.gestures.inferred else head.gestures
     of_dataset = replace(spec, layout=head.layout, gestures=of_set, layout_origin="that of the data set")
-    scan = scan_source(source, of_dataset)
+    scan = _admitted(scan_source(source, of_dataset), dest, settings)
     scan.simulated |= settings.get("simulated", False)
     try:
         result = add_to_dataset(dest, scan, spec.gestures, people, progress, generation)

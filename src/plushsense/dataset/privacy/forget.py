@@ -1,9 +1,9 @@
 """Remove a person from a data set: raw and session files, marks, the people's table, caches, evaluations.
 
 This is the only operation that rewrites append-only files. The intent is written first (``forgetting.json``), so that
-the same call finishes an interrupted run. Only a line in ``forgotten.jsonl`` remains, with the day and the number of
-files but not the person, not even as a hash, which could be reversed since there are few codes. Programs that use the
-data set at the same time can no longer write results (`dataset.store.Generation`).
+the same call finishes an interrupted run. In the data set only a line in ``forgotten.jsonl`` remains, with the day and
+the number of files but not the person; the home that it lies in remembers the code (`dataset.privacy.removed`).
+Programs that use the data set at the same time can no longer write results (`dataset.store.Generation`).
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ from plushsense.dataset.files import (
 )
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, adding_locked, locked
+from plushsense.dataset.privacy.removed import home_of, remember_removed
 from plushsense.dataset.privacy.searching import NamePatterns, is_searchable, texts_in, words_of_rows
 from plushsense.dataset.store import (
     FORGOTTEN,
@@ -286,15 +287,17 @@ def find_mentions(places: Iterable[Path], subject: str, apart_from: Path) -> Ite
             here = Path(at)
             yield from (here / name for name in folders if name == subject)
             folders[:] = [name for name in folders if name != subject and (here / name).resolve() != apart_from]
-            for path in (here / name for name in names):
-                raw = path.suffix.lower() == ".csv" and {RECORDINGS, STREAMS} & set(path.parts)
-                try:
-                    texts = iter([words_of_rows(path.read_bytes())]) if raw else texts_in(path)
-                    found = _named(path.name, subject) or any(_holds(text, subject) for text in texts)
-                except (OSError, ValueError):
-                    found = True
-                if found:
-                    yield path
+            yield from (here / name for name in names if mentions(here / name, subject))
+
+
+def mentions(path: Path, subject: str) -> bool:
+    """Return whether a file contains the code of a person in its name or its text, or cannot be read."""
+    raw = path.suffix.lower() == ".csv" and {RECORDINGS, STREAMS} & set(path.parts)
+    try:
+        texts = iter([words_of_rows(path.read_bytes())]) if raw else texts_in(path)
+        return _named(path.name, subject) or any(_holds(text, subject) for text in texts)
+    except (OSError, ValueError):
+        return True
 
 
 def forget(dataset: str | Path, subject: str) -> RemovalPlan:
@@ -315,6 +318,8 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
         with adding_locked(folder), locked(folder):
             # Plan again under the lock, since other programs may have written until now.
             plan = plan_removal(folder, subject)
+            if not plan.absent and (home := home_of(folder)) is not None:
+                remember_removed(home, subject)
             intent = None if plan.absent else _begin(folder, plan)
             _remove_derived(folder, plan)
             _remove_own(folder, plan)

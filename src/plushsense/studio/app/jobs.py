@@ -11,13 +11,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.files import write_file
+from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.studio.app.workspace import WORK, ChangeSignal, Workspace, refusal_of
 
 UNFINISHED = ".unfinished-"
@@ -26,8 +27,8 @@ INCOMING = "incoming"
 """Folder in the work folder for uploaded files that are not imported yet; it is removed when the studio starts."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _MAX_REPORTS = 2000
-# Keys of a spec that are never stored, because they identify people.
-_SECRET_KEYS = ("person",)
+# Keys of a spec or result that are never stored, because they identify people.
+_SECRET_KEYS = ("person", "chosen", "receipt")
 _STOP_S = 10.0
 
 
@@ -127,10 +128,17 @@ class Jobs:
                     name=path.name,
                 )
 
-    def import_sessions(self, sessions: Iterable[Path], dest: Path, title: str) -> StudioJob:
-        """Start to import recorded sessions into the data set ``dest``, which is created if it does not exist."""
+    def import_sessions(self, sessions: Sequence[Path], dest: Path, title: str, readmit: bool = False) -> StudioJob:
+        """Start to import recorded sessions into the data set ``dest``, which is created if it does not exist.
+
+        Raises:
+            DatasetError: unless ``readmit``, for sessions of a person who was removed from the workspace.
+        """
+        if not readmit:
+            refuse_removed(self._workspace.recordings, {session.parent.name for session in sessions})
         spec: dict[str, Any] = {
             "sessions": [str(session) for session in sessions],
+            "readmit": readmit,
             "recordings": str(self._workspace.recordings),
             "work": str(self._folder),
             "dest": str(dest),
@@ -254,6 +262,7 @@ class Jobs:
         stored = asdict(job)
         for key in _SECRET_KEYS:
             stored["spec"].pop(key, None)
+            stored["result"].pop(key, None)
         write_file(self._folder / f"{job.id}.json", json.dumps(stored, default=str))
 
 

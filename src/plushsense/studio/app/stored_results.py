@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import math
+import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -379,7 +381,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             split,
             str(context),
             bool(scores.get("leaky")),
-            bool(origin.get("simulated")),
+            bundle.simulated,
             str(training.get("seed", "?")),
             # Unless whole people were held back, the network was trained on the people it was scored on.
             *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
@@ -616,7 +618,7 @@ class StoredResults:
             return predictions
         files = prediction_files(read_json(self._inside(row.path / SWEEP))) if row.kind == TRIAL else {}
         file = self._inside((row.proof or row.path) / files.get(row.trial, PREDICTIONS))
-        stored = self._once(file, lambda path, _: read_predictions(path), None, refuse=True)
+        stored = self._once(file, _read_apart, None, refuse=True)
         assert stored is not None
         return stored
 
@@ -670,6 +672,12 @@ class StoredResults:
             self._read[key] = cached
         result: T | None = cached[1]
         return result
+
+
+def _read_apart(path: Path, _: None) -> Predictions:
+    """Read stored predictions in a process of its own, because the reader of Parquet takes 45 MB until its end."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(read_predictions, path).result()
 
 
 def recordings_of_cell(

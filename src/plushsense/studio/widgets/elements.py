@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import inspect
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from nicegui.element import Element
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import plain_label
+from plushsense.dataset.privacy.removed import CONSENT
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import (
     Kind,
@@ -53,7 +55,7 @@ _TITLES = {
     "check": "Checking “{name}”",
     "backup": "Backup of “{name}”",
     "restore": "Restoring “{name}”",
-    "forget": "Removing a person from “{name}”",
+    "forget": "Forgetting a person everywhere",
     "export": "Export “{name}”",
     "profile": "Cost of “{name}”",
     "verify": "Verify “{name}”",
@@ -141,6 +143,26 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
         with ui.row().classes("w-full justify-end"):
             button("", words("Cancel"), dialog.close, "flat" if label else "flat autofocus")
             button("ask-go", go, done, "unelevated" if label else "outline")
+
+
+async def admitting(page: Page, work: Callable[[bool], Any]) -> bool:
+    """Call ``work(False)``; if people would come back who were removed, ask, and then call ``work(True)``.
+
+    Returns:
+        Whether the work is done; otherwise it was refused, or the question is open.
+    """
+    words = page.words
+    with page.show_errors():
+        try:
+            if inspect.isawaitable(done := work(False)):
+                await done
+            return True
+        except PlushSenseError as refusal:
+            if refusal.message.values.get("needs") != CONSENT:
+                raise
+            go_on = words("Take them in anyway")
+            ask(words, words.error(refusal), go_on, lambda _: admitting(page, lambda _: work(True)))
+    return False
 
 
 async def change_files(

@@ -1,19 +1,22 @@
-"""Build the section of the data sets and their backups, and the dialog that removes a person."""
+"""Build the section of the data sets and their backups."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from nicegui import run, ui
 
-from plushsense.dataset.privacy.forget import people_of_dataset
+from plushsense.dataset.backup import backup_people
+from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
-from plushsense.studio.app.shell import Page, button, heading, named, on_page, tag
+from plushsense.studio.app.shell import Page, button, named, on_page, tag
 from plushsense.studio.app.words import in_context
-from plushsense.studio.app.workspace import BACKUPS, BUNDLES, DATASETS, plain_name
+from plushsense.studio.app.workspace import BACKUPS, DATASETS, plain_name
+from plushsense.studio.pages.home.forgetting import ForgetDialog
 from plushsense.studio.pages.home.overview import DatasetEntry, WorkspaceSummary
 from plushsense.studio.pages.home.sections import (
     SMALL,
@@ -23,10 +26,7 @@ from plushsense.studio.pages.home.sections import (
     simulation_badge,
     titled_card,
 )
-from plushsense.studio.widgets.elements import on_enter, open_dialog, size, summary
-from plushsense.workflow.datasets import Forgotten, forget
-
-_MAX_PATHS = 5
+from plushsense.studio.widgets.elements import admitting, size, summary
 
 
 class DatasetSection:
@@ -37,6 +37,8 @@ class DatasetSection:
         with titled_card(page, "Data sets", "datasets"):
             self._rows = ui.column().classes("w-full ps-small-gap")
             self._backups = tag(ui.element("details").classes("w-full"), "backups")
+            forget = on_page(ForgetDialog(page, jobs).open)
+            button("forget-open", page.words("Forget a person everywhere"), forget, "flat", icon="person_remove")
 
     def fill(self, contents: WorkspaceSummary) -> None:
         """Replace the displayed data sets by those of ``contents``."""
@@ -56,10 +58,7 @@ class DatasetSection:
                 if entry.simulated:
                     simulation_badge(page)
                 ui.space()
-                more = {
-                    words("Make a backup"): lambda: self._backup(entry),
-                    words("Remove a person"): lambda: ForgetDialog(page, self._jobs, entry).open(),
-                }
+                more = {words("Make a backup"): lambda: self._backup(entry)}
                 self._actions.menu(entry.path, entry.name, {} if entry.refused else more)
             if entry.refused:
                 ui.label(words.sentence(entry.refused)).classes("ps-bad ps-break")
@@ -97,7 +96,7 @@ class DatasetSection:
             self._jobs.start("backup", spec, self._page.words("Backup of “{name}”", name=entry.name))
 
     def _show_backups(self, backups: Sequence[Path]) -> None:
-        words = self._page.words
+        page, words = self._page, self._page.words
         self._backups.clear()
         self._backups.set_visibility(bool(backups))
         with self._backups:
@@ -107,123 +106,21 @@ class DatasetSection:
                     ui.label(f"{path.stem} · {size(path.stat().st_size, words)}").classes("flex-grow ps-break")
                     link = ui.link(words("Download"), download_address(BACKUPS, path.stem)).classes("ps-link")
                     named(link.props("download"), f"{words('Download')}: {path.stem}")
-                    restore = on_page(lambda path=path: self._restore(path))
+                    restore = on_page(lambda path=path: admitting(page, partial(self._restore, path)))
                     button("", words("Restore"), restore, SMALL, about=path.stem)
                     discard = on_page(lambda path=path: self._discard(path))
                     button("", words("Discard"), discard, SMALL, about=path.stem)
 
-    def _restore(self, path: Path) -> None:
+    async def _restore(self, path: Path, readmit: bool) -> None:
         """Start to restore a backup as a new data set; the present one is not changed."""
         workspace = self._page.workspace
-        with self._page.show_errors():
-            name = workspace.free_name(DATASETS, path.stem, separator=" ")
-            spec = {"file": str(path), "dest": str(workspace.new(DATASETS, name)), "name": name}
-            self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))
+        if not readmit:
+            refuse_removed(path, await run.io_bound(backup_people, path) or ())
+        name = workspace.free_name(DATASETS, path.stem, separator=" ")
+        spec = {"file": str(path), "dest": str(workspace.new(DATASETS, name)), "name": name, "readmit": readmit}
+        self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))
 
     async def _discard(self, path: Path) -> None:
         workspace = self._page.workspace
         message = self._page.words("“{name}” is discarded. It can be restored on the home page.", name=path.stem)
         await self._actions.change(lambda: workspace.discard(path), message, workspace.restore)
-
-
-class ForgetDialog:
-    """Dialog that removes a person from a data set: choose the person, see everything, then type the code."""
-
-    def __init__(self, page: Page, jobs: Jobs, entry: DatasetEntry) -> None:
-        self._page, self._words, self._jobs, self._entry = page, page.words, jobs, entry
-        self._person = ""
-
-    async def open(self) -> None:
-        """Open the dialog with the choice of the person."""
-        words = self._words
-        with self._page.show_errors():
-            self._jobs.check_unused(self._entry.path)
-            people = await run.io_bound(people_of_dataset, self._entry.path) or []
-            title = words("Removing a person from “{name}”", name=self._entry.name)
-            with open_dialog(title, "forget", "ps-dialog") as self._dialog:
-                heading(title, 2)
-                choice = ui.select(
-                    people, label=words("Code of the person"), on_change=lambda e: self._preview(e.value)
-                )
-                tag(choice.classes("w-full"), "forget-person")
-                self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
-                with ui.row().classes("w-full justify-end"):
-                    button("", words("Cancel"), self._dialog.close, "flat")
-
-    async def _preview(self, person: str) -> None:
-        """Show what would be removed and what would be left."""
-        words, workspace = self._words, self._page.workspace
-        self._person = person
-        found: Forgotten | None = None
-        with self._page.show_errors():
-            path = self._entry.path
-            found = await run.io_bound(lambda: forget(path, person, bundles=[workspace.folder / BUNDLES]))
-        self._box.clear()
-        if found is None:
-            self._dialog.close()
-            return
-        plan = found.plan
-        with self._box:
-            text = words(
-                "This is removed and cannot be restored: {files} files, of which {raw} are recordings or streams; "
-                "{marks} marks.",
-                files=len(plan.files),
-                raw=plan.raw,
-                marks=plan.marks,
-            )
-            ui.label(text).classes("text-bold")
-            self._paths(plan.files)
-            if derived := [*plan.caches, *plan.evaluations, *plan.leftovers]:
-                ui.label(words("Everything that may be derived from the person is removed, too:"))
-                self._paths(derived)
-            sessions = workspace.recordings / person
-            rest = [
-                *([str(sessions)] if sessions.is_dir() else ()),
-                *(b.bundle for b in found.bundles),
-                *found.discarded,
-                *found.elsewhere,
-                *(str(p) for p in sorted((workspace.folder / BACKUPS).glob("*.zip"))),
-                *(str(self._entry.path / mention) for mention in plan.mentions),
-                *([f"https://doi.org/{plan.published}"] if plan.published else ()),
-            ]
-            ui.label(words("This remains. Look through it and delete it yourself:")).classes("text-bold")
-            self._paths(dict.fromkeys(rest))
-            text = words(
-                "The studio cannot reach copies elsewhere: memory cards, other computers, toys, published data, keys "
-                "of pseudonyms."
-            )
-            ui.label(text).classes("ps-note")
-            button("forget-next", words("Go on"), self._confirm, "outline color=negative")
-
-    @staticmethod
-    def _paths(paths: Iterable[str]) -> None:
-        listed = list(paths)
-        with ui.column().classes("ps-no-gap w-full"):
-            for path in listed[:_MAX_PATHS]:
-                ui.label(path).classes("ps-break ps-note ps-dim")
-            if len(listed) > _MAX_PATHS:
-                ui.label(f"… + {len(listed) - _MAX_PATHS}").classes("ps-note ps-dim")
-
-    def _confirm(self) -> None:
-        """Ask for the code, and start to remove the person if it is right."""
-        words = self._words
-        self._box.clear()
-
-        def remove() -> None:
-            if str(code.value or "").strip() != self._person:
-                code.error = words("This is not the code of the chosen person.")
-                return
-            self._dialog.close()
-            spec = {"dataset": str(self._entry.path), "person": self._person, "name": self._entry.name}
-            with self._page.show_errors():
-                self._jobs.start("forget", spec, words("Removing a person from “{name}”", name=self._entry.name))
-
-        with self._box:
-            person = self._person
-            text = words(
-                "{person} will be removed from this data set for good. Type the code once more.", person=person
-            )
-            ui.label(text).classes("text-bold ps-break")
-            code = tag(ui.input(words("Code of the person")).props("autofocus").classes("w-full"), "forget-code")
-            on_enter(code, on_page(remove))
-            button("forget-go", words("Remove for good"), on_page(remove), "unelevated color=negative")

@@ -177,7 +177,7 @@ async def show(page: Page) -> None:
     fill(summary or WorkspaceSummary())
     on_change(jobs.changed, update)
     on_change(toys.changed, step.update)
-    on_change(workspace.recording_changed, refresh)
+    on_change(toys.in_use_changed, refresh)
 
 
 class NextStepCard:

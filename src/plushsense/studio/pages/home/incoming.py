@@ -21,11 +21,10 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import layout_names, load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Message
+from plushsense.dataset.files import person_folders
 from plushsense.dataset.importing.archives import UnpackLimits, member_target
-from plushsense.dataset.importing.results import SIMULATED
-from plushsense.dataset.importing.sources import LAYOUT_GUESSED
+from plushsense.dataset.privacy.removed import CONSENT, refuse_removed
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
-from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, heading, on_change, on_page, tag
@@ -56,6 +55,9 @@ def _about(file: str, note: Message) -> Message:
 
 def _is_of_preview(note: str | dict[str, Any]) -> bool:
     """Return whether the preview shows a note in another way."""
+    from plushsense.dataset.importing.results import SIMULATED
+    from plushsense.dataset.importing.sources import LAYOUT_GUESSED
+
     return isinstance(note, dict) and note["template"] in (SIMULATED.template, LAYOUT_GUESSED)
 
 
@@ -70,6 +72,8 @@ class Incoming:
         self.folder = workspace.folder / WORK / INCOMING / uuid.uuid4().hex
         self.dataset = self.folder / "dataset"
         self.refused: list[Message] = []
+        self.readmit = False
+        """Whether people are taken in who were removed."""
         self.bundles: list[str] = []
         """Names of the networks that were added."""
         self._names: list[str] = []
@@ -124,6 +128,8 @@ class Incoming:
 
     def _add_bundle(self, stored: Path) -> None:
         """Check an uploaded network, and move it to the networks of the studio."""
+        from plushsense.models.bundle import Bundle
+
         name = plain_name(stored.stem, "network")
         try:
             if stored.stat().st_size > BUNDLE_BYTES:
@@ -146,6 +152,8 @@ class Incoming:
         Raises:
             ConfigError: for a name that is not a plain file name, or that exists already.
         """
+        if not self.readmit:
+            refuse_removed(self.folder, person_folders(self.dataset))
         place = self._workspace.new(DATASETS, name)
         place.parent.mkdir(parents=True, exist_ok=True)
         write_file(self.dataset / HEAD, replace(DatasetHead.read(self.dataset), name=place.name).to_toml())
@@ -156,6 +164,7 @@ class Incoming:
     def clear(self) -> None:
         """Remove the files."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        self.readmit = False
         self._names.clear()
         self._count = self._bytes = 0
 
@@ -267,6 +276,7 @@ class IncomingSection:
             "dest": str(self._incoming.new_dataset()),
             "layout": self._layout,
             "person": self._person,
+            "readmit": self._incoming.readmit,
             "dry": True,
         }
         self._ended = False
@@ -308,10 +318,16 @@ class IncomingSection:
                 tag(notice(message, "error"), "preview-problem")
             if not result.get("restored"):
                 self._settings(str(result.get("layout", self._layout)), unknown_person, "layout" in needs)
+            if CONSENT in needs:
+                button("import-readmit", words("Take them in anyway"), self._readmit)
             if job.state == DONE:
                 self._keep_row(result)
             else:
                 button("import-cancel", words("Cancel"), on_page(self._cancel), "flat")
+
+    def _readmit(self) -> None:
+        self._incoming.readmit = True
+        self._inspect()
 
     def _contents(self, result: dict[str, Any]) -> None:
         words, people = self._words, result["people"]

@@ -9,14 +9,18 @@ from typing import Any
 
 from nicegui import ui
 
+from plushsense.dataset.files import person_folders
+from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, page_texts, tag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BACKUPS, DATASETS, DISCARDED
+from plushsense.studio.pages.home.forgetting import receipt_text
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
 from plushsense.studio.widgets.elements import (
     JOB_STATES,
+    admitting,
     ask,
     change_files,
     errors_beside,
@@ -135,8 +139,10 @@ class DiscardedSection:
     def _row(self, path: Path, text: str, name: str) -> None:
         words, workspace, change = self._page.words, self._page.workspace, self._actions.change
 
-        async def restore() -> None:
-            await change(lambda: workspace.restore(path), words("“{name}” is restored.", name=name))
+        def restore(readmit: bool) -> Awaitable[None]:
+            if not readmit:
+                refuse_removed(path, (path.parent.name, *person_folders(path)))
+            return change(lambda: workspace.restore(path), words("“{name}” is restored.", name=name))
 
         async def delete(_: str) -> None:
             await change(lambda: workspace.delete(path), words("“{name}” is deleted.", name=name))
@@ -147,7 +153,7 @@ class DiscardedSection:
 
         with ui.row().classes("ps-row items-center w-full ps-small-gap"):
             ui.label(text).classes("flex-grow ps-break")
-            button("", words("Restore"), on_page(restore), SMALL, about=name)
+            button("", words("Restore"), on_page(lambda: admitting(self._page, restore)), SMALL, about=name)
             button("", words("Delete for good"), ask_delete, SMALL, about=name)
 
 
@@ -225,6 +231,8 @@ class SessionSection:
             words("recordings: {n}", n=entry.recordings),
             words(_STATES["active" if entry.active else "finished" if entry.finished else "unfinished"]),
         ]
+        if entry.removed:
+            facts.append(words("this person was removed"))
         if entry.datasets:
             facts.append(words("in the data sets {names}", names=", ".join(f"“{n}”" for n in entry.datasets)))
         return " · ".join(facts)
@@ -232,23 +240,24 @@ class SessionSection:
     def _choose(self, entry: SessionEntry, chosen: bool) -> None:
         (self._chosen.add if chosen else self._chosen.discard)(str(entry.path))
 
-    def _make(self, batch: tuple[SessionEntry, ...], name: ui.input) -> None:
+    async def _make(self, batch: tuple[SessionEntry, ...], name: ui.input) -> None:
         with errors_beside(self._page, name):
             place = self._page.workspace.new(DATASETS, str(name.value or ""))
-            self._start(batch, place, place.name)
+            await self._start(batch, place, place.name)
 
-    def _add(self, batch: tuple[SessionEntry, ...], dataset: str) -> None:
+    async def _add(self, batch: tuple[SessionEntry, ...], dataset: str) -> None:
         with self._page.show_errors():
             place = self._page.workspace.inside(dataset)
-            self._start(batch, place, self._page.workspace.title(place))
+            await self._start(batch, place, self._page.workspace.title(place))
 
-    def _start(self, batch: tuple[SessionEntry, ...], place: Path, name: str) -> None:
+    async def _start(self, batch: tuple[SessionEntry, ...], place: Path, name: str) -> None:
         chosen = [s.path for s in batch if str(s.path) in self._chosen]
         if not chosen:
             self._page.say(self._page.words("No session is chosen. Tick at least one."), "warning")
             return
         self._page.say("")
-        self._jobs.import_sessions(chosen, place, self._page.words("Import into the data set “{name}”", name=name))
+        title = self._page.words("Import into the data set “{name}”", name=name)
+        await admitting(self._page, lambda readmit: self._jobs.import_sessions(chosen, place, title, readmit))
 
 
 class JobList:
@@ -336,10 +345,12 @@ class JobList:
             link = ui.link(words("Download"), download_address(BACKUPS, place.stem)).classes("ps-link")
             tag(link.props("download"), "download")
         if job.task == "forget":
-            removed = words(
-                "The person is removed, with {n} files. Delete what remains elsewhere, too.", n=result["files"]
-            )
-            ui.label(removed)
+            ui.label(words("Removed for good: {n}. Not removed: {left}.", n=result["removed"], left=result["left"]))
+            # The receipt names the person, so that it is not stored.
+            if receipt := result.get("receipt"):
+                text, file = receipt_text(page, receipt, job.ended_s), f"{words('receipt')}.txt"
+                save = words("Save the receipt")
+                button("receipt", save, lambda: ui.download.content(text, file), SMALL, icon="download")
         if job.task in ("import", "simulate", "restore"):
             people = result.get("subjects", result.get("people", 0))
             facts = [words("recordings: {n}", n=result["recordings"]), words("people: {n}", n=people)]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from nicegui import ui
 
-from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
+from plushsense.core.errors import BadInput, ConfigError, DatasetError, PlushSenseError
 from plushsense.core.recorder_csv import parse_name
 from plushsense.experiments.adaptation import adapt
 from plushsense.live.adaptation import Personal
@@ -137,15 +137,22 @@ class PersonFields:
 
     def checked(self, field: ui.input) -> str:
         """Return the code; if it is missing or invalid, say so beside ``field`` and return ""."""
-        text = ""
         try:
             text = check_subject(self.code)
+            if known := self._page.workspace.codes().same(text):
+                raise DatasetError(
+                    "“{code}” is written almost like {known}. Enter {known} if it is the same person, else another "
+                    "code.",
+                    code=text,
+                    known=known,
+                )
         except BadInput as refusal:
             missing = self._page.words(
                 "First enter the code of the person who touches the toy, for example S01 and never a name."
             )
             field.error = self._page.words.error(refusal) if self.code else missing
             field.run_method("focus")
+            return ""
         return text
 
 

@@ -16,11 +16,11 @@ from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
 from plushsense.studio.app.stored_results import ResultRow, StoredResults, recommended
-from plushsense.studio.app.toys import Toys, described, toy_title
+from plushsense.studio.app.toys import ToyInUseError, Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL
 from plushsense.studio.pages.live import adapting, validation_page
-from plushsense.studio.pages.live.event_log import LogButtons
+from plushsense.studio.pages.live.event_log import SIMULATIONS, LogButtons
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
@@ -45,10 +45,12 @@ async def show(page: Page) -> None:
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
         _Controls(page, reader, feed, networks)
-    simulated = tag(notice(words("Simulation: these data say nothing about a real toy.")), "simulation")
+    mark = tag(notice(""), "simulation")
 
     def update_mark() -> None:
-        simulated.set_visibility(reader.device is not None and reader.choice.simulated)
+        mark.set_visibility(bool(kind := reader.simulated))
+        if kind:
+            mark.set_content(words(SIMULATIONS[kind]))
 
     on_change(reader.changed, update_mark)
     update_mark()
@@ -179,10 +181,12 @@ class _Controls:
         self._page.say("")
         self._bundle.error = self._toy.error = None
         done = False
-        with self._page.show_errors():
+        with self._page.show_errors(lambda: self._run(command, *args)):
             try:
                 await asyncio.to_thread(command, *args)
                 done = True
+            except ToyInUseError:
+                raise
             except PlushSenseError as refusal:
                 of_network = isinstance(refusal, BundleError) or refusal.message.values.get("field") == "network"
                 field = self._bundle if of_network else self._toy

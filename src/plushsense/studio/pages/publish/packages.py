@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import shutil
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,19 +15,19 @@ from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.recorder_csv import SIMULATION_MARK
+from plushsense.dataset.files import list_package_files
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.publishing.checking import VALIDATORS
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE
 from plushsense.dataset.publishing.description import CHECKSUMS, REIDENTIFICATION_JSON
 from plushsense.dataset.publishing.keys import is_drawn
-from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import Dataset
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, set_address, tag
 from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import PACKAGES, Workspace
-from plushsense.studio.widgets.elements import WorkPanel, link, notice, size, table, text, verdict
+from plushsense.studio.widgets.elements import WorkPanel, ask, change_files, link, notice, size, table, text, verdict
 
 _VALIDATORS: Texts = {
     "checksums": "Every file is there and unchanged, and there is no other file.",
@@ -268,6 +269,26 @@ class PackagesSection:
                 notice(words("The zip is only made when all validators accept the package."))
             text(words("Upload the package to a repository yourself if you are allowed to. Its folder:"))
             text(str(package.place), classes="ps-path ps-break")
+            delete = words("Delete for good")
+            button("delete", delete, lambda: self._ask_delete(package), "outline color=negative", about=package.name)
+
+    def _ask_delete(self, package: PackageFacts) -> None:
+        words, places = self.words, [p for p in (package.folder, package.zip) if p is not None]
+
+        def delete() -> None:
+            for place in places:
+                self.workspace.part(Jobs).check_unused(place)
+            for place in places:
+                shutil.rmtree(place) if place.is_dir() else place.unlink()
+
+        async def confirmed(_: str) -> None:
+            await change_files(self.page, delete, words("“{name}” is deleted.", name=package.name), self.refresh)
+            if not any(place.exists() for place in places):
+                self._detail.clear()
+                set_address(address("publish"))
+
+        title = words("Delete “{name}” for good? This cannot be undone.", name=package.name)
+        ask(words, title, words("Delete for good"), confirmed)
 
     def _answers(self, package: PackageFacts, job: StudioJob | None) -> None:
         words = self.words

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,16 +11,17 @@ from typing import Any
 from nicegui import run, ui
 
 from plushsense.core.errors import AddressError, ConfigError, DeviceError, LayoutError, PlushSenseError
-from plushsense.recording.plan import DEFAULT, wordings
-from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary
-from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
-from plushsense.studio.app.toys import toy_title
+from plushsense.recording.plan import DEFAULT, load_protocol, wordings
+from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary, check_subject
+from plushsense.studio.app.choices import Choices
+from plushsense.studio.app.shell import Page, address, button, html, named, on_page, query, tag
+from plushsense.studio.app.toys import ToyInUseError, toy_title
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import CHILD, show_child
 from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session_page import collect, show_session
-from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
+from plushsense.studio.widgets.elements import ask, change_files, item_menu, open_dialog, summary
 
 _WORDINGS: Texts = {
     "default": "Standard, in the language of the protocol",
@@ -82,10 +83,10 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
 def _ended(page: Page, session: SessionSummary) -> None:
     """Add the button that leads from an ended session to its recordings."""
 
-    def clicked() -> None:
+    async def clicked() -> None:
         see.disable()
         with page.show_errors():
-            collect(page, session.folder)
+            see.set_enabled(not await collect(page, session.folder))
 
     with tag(ui.row().classes("ps-card ps-next w-full items-center"), "ended-session"):
         text = page.words("Recordings of this session: {n}. They are put into a data set.", n=session.done)
@@ -184,13 +185,17 @@ class _SessionLists:
             work = partial(controller.rename_person, name, code)
             await change(work, message, undo=lambda new: controller.rename_person(new, subject))
 
+        async def settle(code: str) -> None:
+            with self._page.show_errors():
+                await _settle_code(self._page, code, rename, apart_from=subject)
+
         async def discard() -> None:
             message = words("“{name}” is discarded. It can be restored on the home page.", name=name)
             await change(partial(controller.discard, name), message, undo=self._page.workspace.restore)
 
         def ask_code() -> None:
             title = words("The code of the person in {name}", name=name)
-            ask(words, title, words("Change the code"), rename, words("Code of the person"), subject)
+            ask(words, title, words("Change the code"), settle, words("Code of the person"), subject)
 
         actions = {
             words("Not finished yet" if finished else "Finished for this child"): finish,
@@ -203,7 +208,34 @@ class _SessionLists:
         self.fill(await run.io_bound(self._controller.sessions) or [])
 
 
+async def _settle_code(page: Page, code: str, use: Callable[[str], Awaitable[None]], apart_from: str = "") -> None:
+    """Call ``use`` with a person's code; if it is doubtful, ask first, and call it with the answer.
+
+    Raises:
+        DatasetError: for an invalid code.
+    """
+    words = page.words
+    doubt = page.workspace.codes(apart_from).doubt(check_subject(code)) if code else None
+    if doubt is None:
+        await use(code)
+        return
+
+    async def answer(chosen: str) -> None:
+        dialog.close()
+        await on_page(use)(chosen)
+
+    question = words.sentence(doubt.question)
+    with open_dialog(question, "ask") as dialog:
+        ui.label(question).classes("text-lg text-bold ps-break")
+        with ui.row().classes("w-full justify-end"):
+            button("", words("Cancel"), dialog.close, "flat autofocus")
+            for number, (text, chosen) in enumerate(doubt.answers):
+                button(f"code-{number}", words.sentence(text), partial(answer, chosen))
+
+
 def _is_of_toy(error: PlushSenseError) -> bool:
+    if isinstance(error, ToyInUseError):
+        return False
     return isinstance(error, DeviceError | LayoutError | AddressError) or error.message.values.get("field") == "toy"
 
 
@@ -218,7 +250,7 @@ async def _open_session(
     begin.disable()
     page.say(page.words("Opening the toy …"))
     try:
-        with page.show_errors():
+        with page.show_errors(partial(_open_session, page, begin, work, refused)):
             try:
                 session = await run.io_bound(work)
             except PlushSenseError as error:
@@ -237,17 +269,23 @@ class _Form:
 
     def __init__(self, page: Page, controller: RecordController) -> None:
         self._page, self._controller, words = page, controller, page.words
+        self._choices = page.workspace.part(Choices)
         with tag(ui.column().classes("ps-card w-full"), "new-session"):
             html(words("New session"), "h2")
             with ui.row().classes("w-full items-start"):
                 code, consent = words.each("For example S01, never a name", "Required for publishing")
                 age, gender = words.each("For example child, teen, adult", "In the person's own words")
                 self._subject = _input("code", words("Code of the person"), code)
+                self._free = ""
+                with page.show_errors():
+                    self._free = page.workspace.codes().next_free()
                 self._consent = _input("consent", words("Number of the consent form"), consent)
                 self._age = _input("age_group", words("Age group"), age)
                 self._gender = _input("gender", words("Gender"), gender)
             with ui.row().classes("w-full items-start"):
-                self._protocol = _select(self._titles(), "protocol", words("What to record"), PROTOCOL)
+                titles = self._titles()
+                last = self._choices.last("protocol", titles, PROTOCOL)
+                self._protocol = _select(titles, "protocol", words("What to record"), last)
                 self._protocol.on_value_change(self._choose_words)
                 self._words = _select({DEFAULT: DEFAULT}, "wording", words("Wording"), DEFAULT)
                 self._discard = button("discard-protocol", words("Discard this list"), self._discard_protocol)
@@ -258,7 +296,8 @@ class _Form:
                 summary(words("More settings"))
                 with ui.column():
                     layouts = {"": words("Default (plush-15)")} | controller.layouts()
-                    self._layout = _select(layouts, "layout", words("Sensor layout of the toy"), "")
+                    layout = self._choices.last("layout", layouts)
+                    self._layout = _select(layouts, "layout", words("Sensor layout of the toy"), layout)
                     self._simulated = ui.checkbox(words("This is a virtual toy: mark the recordings as a simulation"))
                     self._anew = ui.checkbox(words("Begin a new session even if the person's last one is unfinished"))
                     mark = words("Mark the moment of the first start for the video (white flash and tone)")
@@ -287,16 +326,19 @@ class _Form:
         await change_files(self._page, lambda: workspace.discard(chosen), message, refresh, workspace.restore)
 
     def _choose_words(self) -> None:
-        """Update the selectable wordings to those of the chosen protocol; preselect the page's language."""
+        """Update the wordings to those of the chosen protocol; preselect the last one, or the page's language."""
         self._protocol.error = None
         self._discard.set_visibility(str(self._protocol.value).endswith(".toml"))
         try:
             known = wordings(str(self._protocol.value))
+            # Propose a code, but none where nobody touches the toy.
+            if self._subject.value in (None, "", self._free):
+                self._subject.value = "" if load_protocol(str(self._protocol.value)).needs_nobody else self._free
         except PlushSenseError as refusal:
             self._protocol.error = self._page.words.error(refusal)
             known = (DEFAULT,)
         language = self._page.words.language
-        value = language if language in known else DEFAULT
+        value = self._choices.last("words", known, language if language in known else DEFAULT)
         self._words.set_options({w: self._page.words(_WORDINGS.get(w, w)) for w in known}, value=value)
 
     def _request(self) -> SessionRequest:
@@ -315,17 +357,22 @@ class _Form:
             simulated=simulated,
         )
 
-    async def _begin_session(self) -> Any:
+    async def _begin_session(self) -> None:
         with self._page.show_errors():
             for field in (self._subject, self._protocol):
                 field.error = None
             self._toy.show_error("")
             try:
-                request = self._request()
+                await _settle_code(self._page, str(self._subject.value or "").strip(), self._begin_with)
             except PlushSenseError as error:
-                if self._refused(error):
-                    return
-                raise
+                if not self._refused(error):
+                    raise
+
+    async def _begin_with(self, code: str) -> None:
+        self._subject.value = code
+        with self._page.show_errors():
+            request = self._request()
+            self._choices.keep(protocol=request.protocol, words=request.words, layout=str(request.layout or ""))
             anew, mark, lsl = bool(self._anew.value), bool(self._mark.value), bool(self._lsl.value)
             work = partial(self._controller.begin, request, anew, mark, lsl)
             await _open_session(self._page, self._begin, work, self._refused)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
 
@@ -16,12 +16,14 @@ from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import SessionHead
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.toys import ToyInUseError
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.record.child import CHILD, ConnectionAlert, gesture_picture, style
 from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.last_recording import ResultPanel
 from plushsense.studio.pages.record.panels import SignalPanel, StepList
+from plushsense.studio.widgets.elements import admitting
 
 _STATES: Texts = {
     "countdown": "GET READY",
@@ -51,25 +53,33 @@ _NOTICES: Texts = {
 }
 
 
-def collect(page: Page, folder: Path) -> None:
-    """Import an ended session into a data set that fits, or into a new one; then show its recordings for review."""
+async def collect(page: Page, folder: Path) -> bool:
+    """Import an ended session into a data set that fits, or into a new one; then show its recordings for review.
+
+    Returns:
+        Whether the import has begun; otherwise it was refused, or asks whether to take the person in.
+    """
     jobs, words = page.workspace.part(Jobs), page.words
     head = SessionHead.read(folder)
     if head is None:
         raise DatasetError("The folder {name} holds no session.", name=folder.name)
     place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated, words("recordings"))
     name = page.workspace.title(place)
-    job = jobs.import_sessions([folder], place, words("Import into the data set “{name}”", name=name))
-    page.say(words("The recordings go into the data set “{name}” …", name=name))
 
-    def follow() -> None:
-        if job.state == DONE:
-            ui.navigate.to(address("review", dataset=place))
-        elif job.state != RUNNING:
-            stopped = words("The recordings were not put into a data set: try it again on the home page.")
-            page.say(words.failure(job.refusal) or stopped, "error")
+    def begin(readmit: bool) -> None:
+        job = jobs.import_sessions([folder], place, words("Import into the data set “{name}”", name=name), readmit)
+        page.say(words("The recordings go into the data set “{name}” …", name=name))
 
-    on_change(jobs.changed, follow)
+        def follow() -> None:
+            if job.state == DONE:
+                ui.navigate.to(address("review", dataset=place))
+            elif job.state != RUNNING:
+                stopped = words("The recordings were not put into a data set: try it again on the home page.")
+                page.say(words.failure(job.refusal) or stopped, "error")
+
+        on_change(jobs.changed, follow)
+
+    return await admitting(page, begin)
 
 
 _DRAW_S = 0.1
@@ -321,15 +331,18 @@ class _View:
         words = self._page.words
         self._go_on.disable()
         self._page.say(words("Opening the toy …"))
-        try:
-            await run.io_bound(self._controller.exchange, self._session.name, self._toy.url)
-        except PlushSenseError as error:
-            self._page.say("")
-            self._toy.show_error(words.error(error))
-        finally:
-            self._go_on.enable()
+        with self._page.show_errors(self._exchange_toy):
+            try:
+                await run.io_bound(self._controller.exchange, self._session.name, self._toy.url)
+            except ToyInUseError:
+                raise
+            except PlushSenseError as error:
+                self._page.say("")
+                self._toy.show_error(words.error(error))
+            finally:
+                self._go_on.enable()
 
-    async def _end(self, then: Callable[[], None] | None = None) -> None:
+    async def _end(self, then: Callable[[], Awaitable[object]] | None = None) -> None:
         """End the session, and call ``then``, by default to go to the start page."""
         self._left = True
         with self._page.show_errors():
@@ -337,7 +350,7 @@ class _View:
             if then is None:
                 ui.navigate.to(address("record", ended=self._session.name))
             else:
-                then()
+                await then()
             return
         self._left = False
 

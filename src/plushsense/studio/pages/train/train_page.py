@@ -12,6 +12,7 @@ from nicegui import context, run, ui
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS, VECTOR_FILTERS, VECTOR_SYMBOL
 from plushsense.scoring.splits import parse_split
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, add_style, button, focus, html, on_change, query_path, section, tag
 from plushsense.studio.app.stored_results import (
@@ -217,6 +218,7 @@ class TrainingForm:
         """Read and display the counts of the chosen data set."""
         if not self._dataset:
             return
+        self._page.workspace.part(Choices).keep(dataset=self._dataset)
         self._facts.clear()
         with self._page.show_errors():
             facts = await run.io_bound(self._results.facts, self._page.workspace.inside(self._dataset))
