@@ -136,10 +136,23 @@ def test_what_was_recorded_once_is_named_before_the_training(studio: Fixture, lo
     dataset = few / "datasets" / "virtual"
     for person in ("P02", "P03"):
         shutil.rmtree(dataset / "recordings" / person)
+    # A job that gave a warning twice, and whose network was right in every epoch.
+    reports = [{"stage": "training", "epoch": e, "train_accuracy": 1.0, "accuracy": 1.0} for e in (1, 2)]
+    told = {"id": "1", "task": "train", "spec": {"dataset": str(dataset)}, "title": "t", "state": "stopped"}
+    told |= {"warnings": [{"message": m} for m in ("One.", "One.", "Two.")], "reports": reports}
+    (few / "work").mkdir()
+    (few / "work" / "1.json").write_text(json.dumps(told), encoding="utf-8")
     here = studio(home=few)
     browser = look(PHONE, dark=True, language="lv")
     page = browser.open(f"{here.url}/train")
     notice = marked(page, "recorded-once")
     notice.wait_for()
     assert "Šiem žestiem ir tikai pa vienam ierakstam: " in notice.inner_text()
+    warnings = marked(page, "warnings")
+    warnings.locator(".q-item").first.click()
+    assert "(2)" in warnings.inner_text() and warnings.get_by_text("• ").count() == 2
+    marked(page, "curves").locator(".q-item").first.click()
+    marked(page, "curve-accuracy").locator("canvas").wait_for()
+    scale = "() => getElement(+document.querySelector('[data-test=curve-accuracy]').id.slice(1)).u.scales.y"
+    assert {key: page.evaluate(scale)[key] for key in ("min", "max")} == {"min": 0, "max": 1}
     assert axe(page) == [] and browser.complaints == []

@@ -254,6 +254,10 @@ def test_the_plot_labels_every_point_and_marks_leaky_ones() -> None:
     assert points["labelLayout"] == {"hideOverlap": True}
     assert front["data"] == [[r.parameters, r.macro_f1] for r in rows]
     assert bars["data"][:2] == [[1000, pytest.approx(0.19)], [1000, pytest.approx(0.21)]]
+    # Neither a bar nor the axis goes beyond 1.
+    high = pareto_options(Words("en"), [replace(rows[0], macro_f1=0.98, macro_f1_sd=0.3), rows[1]])
+    assert high["yAxis"]["max"] == 1 and high["series"][0]["data"][1] == [1000, 1.0]
+    assert "max" not in pareto_options(Words("en"), rows)["yAxis"]
     # Points on one spot can be plotted as well.
     assert len(pareto_options(Words("lv"), rows[:1] * 3)["series"][2]["data"]) == 3
     # The text alternative holds the same data and escapes it.

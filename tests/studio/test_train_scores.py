@@ -155,7 +155,7 @@ def test_a_verdict_names_its_limits(home: Path) -> None:
     assert headline(w, row) == "It reads about 4 of 10 touches of one person it never met; guessing gives 0.6 of 10."
     assert limits(w, row)[0] == "This figure is uncertain: it was measured on only 1 person."
     assert headline(w, replace(row, split="by-recording:5")).startswith(
-        "It reads about 4 of 10 moments, with those at rest, of people it knows"
+        "It reads about 4 of 10 moments, with those at rest, of the one person it knows"
     )
     leaky = replace(row, split="windows:5", leaky=True)
     assert "this test is too easy" in headline(w, leaky) and limits(w, leaky) == []

@@ -83,6 +83,16 @@ def show_verdict(w: Words, row: ResultRow | None, look: str = "") -> None:
         tag(ui.label(w(_VERDICTS["unusable"])).classes(f"text-bold{bad}"), "not-usable")
 
 
+def show_result(w: Words, row: ResultRow, look: str) -> None:
+    """Add the main sentence on a result, how sure it is, and its exact figures."""
+    show_verdict(w, row, look)
+    for sentence in limits(w, row):
+        ui.label(sentence)
+    if row.simulated:
+        ui.label(w("Simulation: these data say nothing about a real toy."))
+    tag(ui.label(figures(w, row)).classes("ps-dim"), "result")
+
+
 def show_choice(w: Words, networks: Mapping[Path, ResultRow], chosen: str | None, look: str = "") -> None:
     """Add the verdict on the network that is chosen on a page, or why none is chosen there at first."""
     if chosen:

@@ -20,7 +20,7 @@ from plushsense.studio.app.stored_results import (
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.train.job_requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
 from plushsense.studio.widgets.elements import JOB_STATES, KINDS_OF_TRAINING, Plot
-from plushsense.studio.widgets.verdict import figures, limits, network_links, people_table, show_verdict
+from plushsense.studio.widgets.verdict import network_links, people_table, show_result
 
 _CURVES_ABOUT: Texts = {
     "make": (
@@ -343,12 +343,7 @@ class _Card:
         marks = score_labels(w, row.leaky, row.simulated)
         if marks:
             tag(html(marks), "marks")
-        show_verdict(w, row, "ps-verdict-text")
-        for sentence in limits(w, row):
-            ui.label(sentence)
-        if row.simulated:
-            ui.label(w("Simulation: these data say nothing about a real toy."))
-        tag(ui.label(figures(w, row)).classes("ps-dim"), "result")
+        show_result(w, row, "ps-verdict-text")
         if row.people:
             bars = ui.expansion(w("Scores of each person"), icon="groups", value=True).classes("w-full")
             with tag(bars, "people-bars"):

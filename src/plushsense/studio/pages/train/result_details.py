@@ -27,7 +27,6 @@ from plushsense.studio.app.shell import (
     tag,
 )
 from plushsense.studio.app.stored_results import (
-    EVALUATION,
     HELD_BACK,
     TRAINING,
     Confusion,
@@ -35,20 +34,18 @@ from plushsense.studio.app.stored_results import (
     ResultDetails,
     ResultRow,
     StoredResults,
-    averaged_over,
     context_text,
     counted,
     figure,
     leaky_warning,
     score_labels,
-    score_text,
     split_text,
 )
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import plain_name
 from plushsense.studio.pages.train.job_requests import export_request
 from plushsense.studio.widgets.elements import table_html
-from plushsense.studio.widgets.verdict import comparison, figures, limits, network_links, show_verdict
+from plushsense.studio.widgets.verdict import comparison, network_links, show_result
 
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
 
@@ -91,10 +88,7 @@ class ResultDetailsView:
                 icon_button("close", w("Close"), self._close, color=None)
             if row.leaky:
                 ui.label(leaky_warning(w))
-            show_verdict(w, row, "text-bold")
-            for sentence in limits(w, row):
-                ui.label(sentence)
-            tag(ui.label(figures(w, row)).classes("ps-dim"), "details-figures")
+            show_result(w, row, "text-bold")
             sizes = {"parameters": w.count(row.parameters), "macs": w.count(row.macs)}
             ui.label(w("{parameters} parameters, {macs} multiply-accumulates in 50 ms.", **sizes)).classes("ps-dim")
             if row.kind == TRAINING:
@@ -325,20 +319,8 @@ class ResultDetailsView:
     # People ---------------------------------------------------------------------------------------------------
 
     def _people(self, d: ResultDetails) -> None:
-        w, row = self._words, d.row
+        w = self._words
         heading(w("Scores of each person"), 4)
-        scores = [one["macro_f1"] for one in d.people if one["macro_f1"] is not None]
-        if row.kind == EVALUATION and scores:
-            text = w(
-                "Accuracy {accuracy}, macro-F1 {macro_f1} (mean ± standard deviation over {over}); macro-F1 of "
-                "single people from {low} to {high}.",
-                accuracy=score_text(w, row.accuracy, row.accuracy_sd),
-                macro_f1=score_text(w, row.macro_f1, row.macro_f1_sd),
-                over=averaged_over(w, row.spread, row.units),
-                low=figure(w, min(scores)),
-                high=figure(w, max(scores)),
-            )
-            tag(ui.label(text), "spread")
         head = w.each("Person", "Recordings", "Windows", "Accuracy", "Macro-F1", "Accuracy by recording")
         keys = ("accuracy", "macro_f1", "by_recording_accuracy")
         cells = [(p["subject"], p["recordings"], p["windows"], *(figure(w, p[key]) for key in keys)) for p in d.people]

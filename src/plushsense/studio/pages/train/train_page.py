@@ -195,8 +195,8 @@ class TrainingForm:
     def _usual_fields(self) -> None:
         w = self._words
         about = w(
-            "Choose the data set and press the button. The network is trained for live use, then tested on people that "
-            "it never met."
+            "Choose the data set and press the button. The network is trained for live use, then tested: on people "
+            "that it never met, if there are at least three."
         )
         ui.label(about)
         with ui.row().classes("w-full items-start"):
@@ -236,12 +236,11 @@ class TrainingForm:
                 if 0 < facts.people < FEW_PEOPLE:
                     ui.label(w("With so few people, every score is uncertain.")).classes("ps-dim")
             if facts.once:
+                names = [*map(w.gesture, facts.once[:_LISTED]), *["…"] * (len(facts.once) > _LISTED)]
                 text = w(
                     "There is only one recording of: {gestures}. A network cannot learn from one recording and be "
                     "tested on another: record each gesture at least two more times before you train.",
-                    gestures=", ".join(
-                        [*map(w.gesture, facts.once[:_LISTED]), *("…" for _ in facts.once[_LISTED:][:1])]
-                    ),
+                    gestures=", ".join(names),
                 )
                 with self._facts:
                     tag(notice(text), "recorded-once")
