@@ -250,13 +250,15 @@ class _Controls:
         for control in (self._toy, self._look, self._simulated):
             control.set_enabled(not running)
         choice = reader.choice
-        now = f": {choice.toy} · {choice.bundle.stem}" if running and choice.bundle is not None else ""
+        now = (
+            f": {toy_title(words, choice.toy)} · {choice.bundle.stem}" if running and choice.bundle is not None else ""
+        )
         self._title.set_content(words("Toy, network and settings") + now)
         step_s = reader.bundle.arch.step * reader.bundle.layout.period_us / 1e6 if reader.bundle is not None else 0.05
         rates = words(
             "These two change only this page. The network itself answers {n} times a second, and neither events nor "
             "reactions wait for the page.",
-            n=words.number(1.0 / step_s),
+            n=round(1.0 / step_s),
         )
         self._rates.set_text(rates)
         self._follow()
