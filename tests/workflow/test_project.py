@@ -29,7 +29,7 @@ def test_a_project_holds_data_and_networks_and_replaces_nothing(tmp_path: Path) 
     with pytest.raises(DatasetError, match="no data set and no network"):
         save_project(tmp_path / "empty.zip", [], [])
     assert is_project(saved) and not is_project(network)
-    assert project_people(saved) == ["P01"] and project_people(network) == []
+    assert project_people(saved) == ["P01", "none"] and project_people(network) == []
 
     # Twice: data sets get a number, the same network is not doubled.
     for names in (("virtual",), ("virtual 2",)):

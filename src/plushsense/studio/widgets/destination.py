@@ -10,8 +10,6 @@ from typing import Any
 from nicegui import run, ui
 
 from plushsense.core.sentences import join_names
-from plushsense.dataset.index import open_dataset
-from plushsense.dataset.privacy.forget import take_out
 from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, named, on_change, tag
@@ -109,6 +107,9 @@ async def take_back(page: Page, dataset: Path, sessions: Sequence[str], then: Ca
 
 def _take_back(workspace: Workspace, dataset: Path, sessions: Sequence[str]) -> None:
     """Take sessions out of a data set; one that holds nothing else is discarded."""
+    from plushsense.dataset.index import open_dataset
+    from plushsense.dataset.privacy.forget import take_out
+
     theirs = tuple(f"{name}/" for name in sessions)
     if all(info.id.startswith(theirs) for info in open_dataset(dataset).recordings):
         workspace.discard(dataset)
