@@ -127,7 +127,7 @@ def test_a_label_in_a_column_a_single_file_and_damaged_ones(studio: Fixture, loo
     assert found.layout.names == ("s1", "s2") and found.layout.rate_hz == 50.0
     # A single table without a clock, of one person.
     one = tmp_path / "one.csv"
-    lines = [f"{k % 7};{k % 5};{'hug' if k % 100 < 50 else 'poke'}" for k in range(400)]
+    lines = [f"{3 * k % 7};{3 * k % 5};{'hug' if k % 100 < 50 else 'poke'}" for k in range(400)]
     one.write_text("\n".join(["Alpha;Beta;was", *lines]))
     bring(page, one)
     marked(page, "map-rate_hz").wait_for(timeout=LONG_MS)
