@@ -96,7 +96,7 @@ def test_a_zip_of_a_new_sensor_comes_in_and_is_used_to_the_end(studio: Fixture, 
     page.get_by_role("option", name="Recording of S01: hug (gloves)").click()
     marked(page, "start").click()
     page.get_by_text("The data of the toy have ended.").wait_for(timeout=LONG_MS)
-    page.goto(f"{url}/export")
+    page.goto(f"{url}/export?model={home / 'bundles' / 'glove.plush'}")
     marked(page, "bundle-facts").get_by_text("glove", exact=True).wait_for(state="attached")
     assert marked(page, "bundle-cannot").count() == 0 and marked(page, "do").is_enabled()
     assert browser.complaints == []
