@@ -130,7 +130,7 @@ def test_too_few_filters_and_a_kernel_that_is_too_long() -> None:
     ("text", "place"), [("", 1), ("8,,12", 3), ("8,a", 3), ("8;12", 2), ("8,0", 3), ("8,", 3), ("8,-1", 3)]
 )
 def test_filters_as_text(text: str, place: int) -> None:
-    assert parse_filters("8, 12 ,16") == (8, 12, 16)
+    assert parse_filters("8, 12 ,16") == parse_filters("8/12/16") == (8, 12, 16)
     with pytest.raises(ArchError, match=f"Filters .* place {place}:"):
         Arch.parse("14", text)
 

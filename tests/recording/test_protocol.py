@@ -70,15 +70,18 @@ def test_the_wordings_of_a_protocol(tmp_path: Path) -> None:
 
 def test_a_random_order_depends_on_the_seed_alone(tmp_path: Path) -> None:
     path = tmp_path / "mixed.toml"
-    saved = save_protocol(path, "mixed", ("Tail pull", "Hold strong"), 2, "random")
+    saved = save_protocol(path, ("Tail pull", "Hold strong"), 2, "random")
     assert saved == load_protocol(path)
     first, second, again = ([(s.gesture, s.repetition) for s in replace(saved, seed=n).steps()] for n in (1, 2, 1))
     assert first == again == [("Tail pull", 1), ("Hold strong", 2), ("Hold strong", 1), ("Tail pull", 2)]
     assert first != second and sorted(first) == sorted(second)
     assert Protocol.from_dict(replace(saved, seed=7).to_dict()).seed == 7
+    kissed = save_protocol(tmp_path / "kiss.toml", ("kiss", "Tail pull"), 1, "gesture", {"kiss": "positive"})
+    assert (kissed.affects, kissed.prompts["kiss"]) == ({"kiss": "positive"}, "kiss")
+    assert Protocol.from_dict(kissed.to_dict()) == kissed and "affects" not in saved.to_dict()
     for gestures, repetitions in (((), 1), (("Tail pull",), 0)):
         with pytest.raises(ConfigError, match=r"at least one|accepted are 1"):
-            save_protocol(tmp_path / "none.toml", "none", gestures, repetitions, "random")
+            save_protocol(tmp_path / "none.toml", gestures, repetitions, "random")
     assert not (tmp_path / "none.toml").exists()
 
 

@@ -33,7 +33,7 @@ def test_from_nothing_to_a_data_set_by_one_click(studio: Fixture, look: Fixture,
     row = marked(page, "dataset")
     assert "people: 6" in row.inner_text() and "recordings: 212" in row.inner_text()
     assert "Simulation" in row.inner_text()
-    assert "virtual://?person=7" in marked(page, "chosen").inner_text()
+    assert "Virtual toy (simulation), person 7" in marked(page, "chosen").inner_text()
     row.get_by_role("button", name="Check").click()
     row.get_by_text("Checked:").wait_for(timeout=LONG_MS)
     assert axe(page) == []
@@ -65,15 +65,16 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     browser = look(TABLET)
     page = browser.open(url)
     assert "Some sessions are not in a data set yet: 1" in marked(page, "next-sentence").inner_text()
-    assert marked(page, "new-name").input_value() == "recordings"
-    marked(page, "new-name").fill("autumn & co")
+    name = marked(page, "batch").locator("[data-test=new-name]")
+    assert name.input_value() == "recordings"
+    name.fill("autumn & co")
     marked(page, "make").click()
     marked(page, "sessions").get_by_role("alert").get_by_text("cannot be a name").wait_for()
     assert axe(page) == []
-    marked(page, "new-name").fill("autumn")
+    name.fill("autumn")
     marked(page, "make").click()
     marked(page, "dataset").get_by_text("recordings: 4").wait_for()
-    assert marked(page, "message").count() == 0
+    marked(page, "message").get_by_text("S01/1 → autumn").wait_for()
     marked(page, "sessions").get_by_text("in the data sets “autumn”").wait_for()
     record(workspace, "S02")
     page.reload()
@@ -82,7 +83,7 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     marked(page, "dataset").get_by_text("recordings: 8").wait_for()
     page.locator("[data-test=batch] .q-checkbox").first.wait_for()
     # Nothing is ticked any more, for all is kept.
-    marked(page, "add").click()
+    marked(page, "make").click()
     marked(page, "message").get_by_text("No session is chosen").wait_for()
     assert axe(page) == []
     assert browser.complaints == []
@@ -137,11 +138,11 @@ def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture, server: Ca
     page.get_by_role("combobox", name="Person who uses the virtual toy").click()
     page.get_by_role("option", name="Person 12").click()
     marked(page, "virtual").click()
-    marked(page, "chosen").get_by_text("virtual://?person=12").wait_for()
+    marked(page, "chosen").get_by_text("person 12").wait_for()
     marked(page, "trial").get_by_text("The toy works").wait_for()
     # Another tab shows the same toy, and hears of a change.
     second = browser.open(one.url)
-    marked(second, "chosen").get_by_text("person=12").wait_for()
+    marked(second, "chosen").get_by_text("person 12").wait_for()
     wrong = {"http://x": "is no kind of toy", "tcp://10.0.0.1:99999": "from 1 to 65535", "": "Enter the address"}
     wrong |= {"serial:///dev/nothing": "There is no port /dev/nothing", "replay:///etc/passwd": "/etc/passwd"}
     for address, reason in wrong.items():
@@ -150,10 +151,10 @@ def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture, server: Ca
         marked(page, "toy").get_by_role("alert").get_by_text(reason).wait_for()
     marked(page, "address").fill("virtual://?person=3")
     marked(page, "use").click()
-    marked(second, "chosen").get_by_text("person=3").wait_for()
+    marked(second, "chosen").get_by_text("person 3").wait_for()
     marked(page, "address").fill("tcp://127.0.0.1:9")
     page.keyboard.press("Enter")
-    marked(page, "chosen").get_by_text("tcp://127.0.0.1:9").wait_for()
+    marked(page, "chosen").get_by_text("Toy in the network 127.0.0.1:9").wait_for()
     marked(page, "trial").get_by_text("does not answer on port 9").wait_for()
     assert axe(page) == []
     # A toy with older firmware: its layout is found, and one press uses it.
@@ -161,7 +162,7 @@ def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture, server: Ca
     marked(page, "address").fill(address)
     marked(page, "use").click()
     marked(page, "use-layout").click()
-    marked(page, "chosen").get_by_text(f"{address}?layout=plush-14").wait_for()
+    marked(page, "trial").get_by_text("layout plush-14 fits").wait_for()
     assert browser.complaints == []
 
 

@@ -112,7 +112,8 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, home: Path) 
     with page.expect_download() as saved:
         marked(page, "log-save").click()
     assert saved.value.suggested_filename.startswith("live-20")
-    rows = list(csv.DictReader(Path(saved.value.path()).read_text(encoding="utf-8").splitlines()))
+    rows = list(csv.DictReader(Path(saved.value.path()).read_text(encoding="utf-8-sig").splitlines()))
+    assert {row["source"] for row in rows} <= {"network", "rules"}
     assert f"{len(rows)} event" in marked(page, "log-count").inner_text()
     assert {row["simulated"] for row in rows} == {"yes"} and {row["network"] for row in rows} == {"little"}
     assert {row["person"] for row in rows} == {""} and any(row["really"] for row in rows)

@@ -42,7 +42,7 @@ def test_a_toy_in_use_is_named_and_freed_by_one_click(studio: Fixture, look: Fix
         marked(live, "events").locator("li[data-id]").first.wait_for()
         with live.expect_download() as saved:
             marked(live, "log-save").click()
-        rows = list(csv.DictReader(Path(saved.value.path()).read_text("utf-8").splitlines()))
+        rows = list(csv.DictReader(Path(saved.value.path()).read_text("utf-8-sig").splitlines()))
         assert {row["simulated"] for row in rows} == {"yes"}
         # A test of the toy says why it cannot be made, and can be made after one click.
         page.goto(server.url)

@@ -231,7 +231,9 @@ def test_long_recordings_are_thinned_to_their_extremes(workspace: Workspace) -> 
     at = np.arange(20_000) * ROW_S
     info = open_dataset(workspace.folder / "datasets" / "waves").recordings[0]
     layout = open_dataset(workspace.folder / "datasets" / "waves").layout
-    read = RecordingSignals(info, layout, np.append(at, 200.0), at, values, np.zeros(20_000))
+    read = RecordingSignals(
+        info, layout, np.append(at, 200.0), at, values, np.zeros(20_000), np.zeros(layout.n_channels)
+    )
     shown = read.curves(ALL)
     assert shown.thinned and len(shown.x) <= 3200
     assert max(v for v in shown.curves[0] if v is not None) == 99_999.0

@@ -53,6 +53,8 @@ _LOOKS = 4
 LONG_MS = 300_000
 """How long to wait for a job of the studio."""
 DESK, TABLET, PHONE = (1280, 800), (820, 1180), (390, 844)
+ZOOM = (640, 400)
+"""What is left of a desk at 200 % zoom."""
 
 
 # Importing takes longer than starting: a server process imports once, and every studio is forked from it.
@@ -266,7 +268,10 @@ def axe(page: Page) -> list[str]:
         page.evaluate(AXE.read_text(encoding="utf-8"))
     findings: list[str] = []
     for _ in range(_LOOKS):
-        found: dict[str, Any] = page.evaluate("() => axe.run(document, {resultTypes: ['violations'], preload: false})")
+        found: dict[str, Any] = page.evaluate(
+            "() => axe.run(document, {resultTypes: ['violations'], preload: false, "
+            "rules: {'target-size': {enabled: true}}})"
+        )
         findings = [
             f"{v['id']} ({v['impact']}): {v['help']}: {node['html'][:160]}"
             for v in found["violations"]
@@ -291,6 +296,22 @@ def english(page: Page) -> list[str]:
         ".flatMap(e => ['aria-label', 'placeholder', 'title'].map(k => e.getAttribute(k) || ''))]"
     )
     return sorted({text for text in texts if _ENGLISH.search(re.sub(r"\S*/\S*", "", text))})
+
+
+def in_sight(page: Page, name: str) -> bool:
+    """Wait until the element has the focus and its beginning is in sight below the bar; False after a while."""
+    from playwright.sync_api import TimeoutError as TooSlow
+
+    try:
+        page.wait_for_function(
+            "name => { const at = document.activeElement, top = at.getBoundingClientRect().top;"
+            " return at.dataset.test === name && top > 50 && top < innerHeight - 40 }",
+            arg=name,
+            timeout=10_000,
+        )
+    except TooSlow:
+        return False
+    return True
 
 
 def marked(page: Page, name: str) -> Any:

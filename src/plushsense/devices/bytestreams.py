@@ -39,8 +39,9 @@ def serial_ports() -> list[tuple[str, str]]:
 
 
 def search_serial(_: float) -> DeviceListing:
-    """List the serial ports."""
-    ports = [(name, "" if about == "n/a" else about) for name, about in serial_ports()]
+    """List the serial ports, but none of the mainboard: Linux lists those also where nothing is connected."""
+    found = [(name, "" if about == "n/a" else about) for name, about in serial_ports()]
+    ports = [(name, about) for name, about in found if not name.startswith("/dev/ttyS")]
     notes: list[str] = [] if ports else [Message("This computer has no serial port now.")]
     return DeviceListing([DeviceInfo(f"serial://{name}", "serial", name, about) for name, about in ports], notes)
 

@@ -104,10 +104,14 @@ def _scaled(spec: str, factor: float, shortest: int) -> str:
 
 
 def parse_filters(text: str) -> tuple[int, ...]:
-    """Return the filter counts of ``"8,12,16"``; raise ArchError for anything but whole numbers from 1."""
-    if not re.fullmatch(f" *{_N} *(?:, *{_N} *)*", text):
+    """Return the filter counts of ``"8,12,16"`` or, as `slashed` writes them, ``"8/12/16"``.
+
+    Raises:
+        ArchError: for anything but whole numbers from 1.
+    """
+    if not re.fullmatch(f" *{_N} *(?:[,/] *{_N} *)*", text):
         fail("write counts joined by commas, as in 8,12,16", text, _end(_FILTERS_BEGIN, text), symbol=False)
-    return tuple(map(int, text.split(",")))
+    return tuple(map(int, re.split("[,/]", text)))
 
 
 def slashed(filters: Iterable[int]) -> str:

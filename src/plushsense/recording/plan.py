@@ -14,7 +14,7 @@ import tomli_w
 
 from plushsense.core.errors import BadInput, ConfigError, nearest
 from plushsense.core.files import write_file
-from plushsense.core.gestures import load_gestures, plain_label
+from plushsense.core.gestures import Gesture, GestureSet, load_gestures, plain_label
 from plushsense.core.recorder_csv import parse_name, recording_filename
 from plushsense.core.toml import builtin_names, load_table, read_named
 
@@ -61,6 +61,7 @@ class Protocol:
     longest_s: float = 60.0
     words: str = DEFAULT
     nobody: tuple[str, ...] = ()
+    affects: dict[str, str] = field(default_factory=dict)
     seed: int = 0
 
     @property
@@ -84,7 +85,7 @@ class Protocol:
     def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON, from which `from_dict` builds the same protocol without other files."""
         table = asdict(self) | {"gestures": list(self.gestures), "nobody": list(self.nobody)}
-        return {key: value for key, value in table.items() if key != "seed" or value}
+        return {key: value for key, value in table.items() if key not in ("affects", "seed") or value}
 
     @classmethod
     def from_dict(
@@ -142,6 +143,7 @@ class ProtocolFile:
         longest_s: time after which the recording ends by itself (1 to 36000).
         words: wording of the prompts to use, such as ``lv`` where prompts have an entry of that name.
         nobody: labels of the gestures recorded without a person; a session stores it (default: by the gesture set).
+        affects: affects of gestures that the set has not, by their labels, as in ``{ kiss = "positive" }``.
         seed: number that a random order is drawn from; a session stores it.
     """
 
@@ -157,6 +159,7 @@ class ProtocolFile:
     longest_s: float = 60.0
     words: str = DEFAULT
     nobody: tuple[str, ...] | None = None
+    affects: dict[str, str] = field(default_factory=dict)
     seed: int = 0
 
 
@@ -169,6 +172,8 @@ def _resolved(file: ProtocolFile, where: str, words: str, beside: Path | None) -
         return {"title": title, "prompts": {label: file_prompts[label] for label in labels}, "words": words}
     own_file = beside / file.gesture_set if beside is not None and file.gesture_set.endswith(".toml") else None
     gesture_set = load_gestures(own_file if own_file is not None and own_file.is_file() else file.gesture_set)
+    own = tuple(Gesture(label, affect) for label, affect in file.affects.items())
+    gesture_set = GestureSet(gesture_set.name, gesture_set.gestures + own)
     gestures = [gesture_set.get(label) for label in labels] or [g for g in gesture_set.gestures if not g.nobody]
     if len({g.label for g in gestures}) < len(gestures) or not gestures or file.gestures == ():
         raise ConfigError(f"The {where} must name every gesture once, and at least one: see its gestures.")
@@ -230,8 +235,14 @@ def _wordings_of(prompts: Mapping[str, Any], labels: Sequence[str], known: Mappi
     return {DEFAULT, *(str(w) for table in tables for w in table)}
 
 
-def save_protocol(path: Path, name: str, gestures: Sequence[str], repetitions: int, order: str) -> Protocol:
-    """Write a protocol of gestures of plush-18, with the built-in prompts, to the new file ``path``; return it.
+def save_protocol(
+    path: Path, gestures: Sequence[str], repetitions: int, order: str, affects: Mapping[str, str] | None = None
+) -> Protocol:
+    """Write a protocol with the built-in prompts to the new file ``path``, whose stem is its name; return it.
+
+    Args:
+        gestures: labels of gestures of plush-18 and of ``affects``.
+        affects: the affect of each gesture that plush-18 has not.
 
     Raises:
         ConfigError: if no gesture is given, or a value is out of range.
@@ -245,8 +256,9 @@ def save_protocol(path: Path, name: str, gestures: Sequence[str], repetitions: i
             most=_MOST_REPETITIONS,
             field="repetitions",
         )
-    table: dict[str, Any] = {"name": name, "title": name, "gesture_set": "plush-18", "gestures": list(gestures)}
-    table |= {"repetitions": repetitions, "order": order}
+    table: dict[str, Any] = {"name": path.stem, "title": path.stem, "gesture_set": "plush-18"}
+    table |= {"gestures": list(gestures), "repetitions": repetitions, "order": order}
+    table |= {"affects": dict(affects)} if affects else {}
     protocol = Protocol.from_dict(table)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, tomli_w.dumps(table))

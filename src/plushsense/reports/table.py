@@ -113,11 +113,11 @@ class Table:
         rows = [[self._heading(c) for c in self.columns], rules, *self.cells()]
         return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
 
-    def csv(self, constants: Row | None = None) -> str:
+    def csv(self, constants: Row | None = None, separator: str = ",") -> str:
         """Return all rows with raw values; ``constants`` are further columns with the same value in each row."""
         constants = constants or {}
         out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
+        writer = csv.writer(out, delimiter=separator, lineterminator="\n")
         writer.writerow([*(c.key for c in self.columns), *constants])
         writer.writerows([*(_value(row, c)[0] for c in self.columns), *constants.values()] for row in self.rows)
         return out.getvalue()

@@ -410,5 +410,5 @@ def _cut(plan: BudgetPlan, learning: object, seconds: float, budget_s: float) ->
     if learning is None and plan.people >= _PEOPLE_FOR_CURVE:
         cut.append({"kind": "learning"})
     if seconds > budget_s:
-        cut.append({"kind": "longer", "minutes": math.ceil(seconds / 60), "budget": round(budget_s / 60)})
+        cut.append({"kind": "longer", "minutes": round(seconds / 60, 1), "budget": round(budget_s / 60)})
     return tuple(cut)

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from plushsense.core.errors import BadInput, ConfigError, DatasetError, FileFormatError
-from plushsense.core.gestures import NOBODY, GestureSet, plain_label
+from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import (
     SIMULATION_MARK,
@@ -65,6 +65,7 @@ def scan_folder(source: Path, spec: ScanSpec, *, around: Path | None = None) -> 
     in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
     rest = sorted(set(files) - set(in_session))
     scan = spec.begin_scan("sessions", files, own)
+    scan.gestures = _with_own_gestures(scan.gestures, sessions)
     plain = [f for f in rest if not is_xdf(f)]
     if spec.columns and len(plain) == len(rest):
         role = next(iter(spec.columns))
@@ -409,6 +410,16 @@ def moved_note(files: Iterable[SourceFile]) -> list[Message]:
             file=first,
         )
     ]
+
+
+def _with_own_gestures(given: GestureSet | None, sessions: Sessions) -> GestureSet | None:
+    """Return the gesture set with the gestures that protocols of the sessions add, and their affects."""
+    heads = [h for h in sessions.values() if isinstance(h, SessionHead)]
+    own = {label: affect for h in heads for label, affect in dict(h.protocol.get("affects") or {}).items()}
+    if given is None or not own:
+        return given
+    new = tuple(Gesture(label, affect) for label, affect in own.items() if given.find(label) is None)
+    return GestureSet(given.name, given.gestures + new, given.inferred)
 
 
 def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:

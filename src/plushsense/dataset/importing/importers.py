@@ -292,7 +292,7 @@ def _add(source: Path, dest: Path, spec: ScanSpec, settings: ImportSettings, pro
     scan = _admitted(scan_source(source, of_dataset), dest, settings)
     scan.simulated |= settings.get("simulated", False)
     try:
-        result = add_to_dataset(dest, scan, spec.gestures, people, progress, generation)
+        result = add_to_dataset(dest, scan, spec.gestures or scan.gestures, people, progress, generation)
     except OSError as cause:
         generation.check()
         raise DatasetError(

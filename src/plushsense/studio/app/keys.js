@@ -1,4 +1,6 @@
 // Keyboard commands of a page: each press is emitted once, as `press`, with what the page showed at that moment.
+const CONTROLS = "button, a[href], summary, [role=button]";
+
 export default {
   template: '<span hidden :data-seen="seen"></span>',
   props: { seen: String, keys: String, fields: Object, aliases: Object },
@@ -6,8 +8,12 @@ export default {
     this.listener = (event) => this.onKey(event);
     // In the capture phase: a space must not also press the button that has the focus.
     for (const type of ["keydown", "keypress", "keyup"]) window.addEventListener(type, this.listener, true);
+    // After a click by mouse or finger the control gives up the focus, so that the next space is a command.
+    this.release = (event) => event.detail > 0 && document.activeElement?.closest(CONTROLS) && document.activeElement.blur();
+    window.addEventListener("click", this.release);
   },
   beforeUnmount() {
+    window.removeEventListener("click", this.release);
     for (const type of ["keydown", "keypress", "keyup"]) window.removeEventListener(type, this.listener, true);
   },
   methods: {
@@ -22,9 +28,8 @@ export default {
         return;
       }
       const typed = event.code === "Space" ? " " : event.key.toLowerCase();
-      if ((typed === " " || typed === "enter") && at.closest && at.closest("[data-own-keys]")) return;
-      // Enter presses the button that has the focus.
-      if (typed === "enter" && at.closest && at.closest("button, a[href], summary, [role=button]")) return;
+      // The space bar and Enter press the control that has the focus.
+      if ((typed === " " || typed === "enter") && at.closest && at.closest(CONTROLS)) return;
       const key = this.aliases[typed] ?? typed;
       if (this.fields[key]) {
         event.preventDefault();

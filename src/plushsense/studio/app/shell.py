@@ -50,9 +50,9 @@ class Keys(Element, component="keys.js"):
         keys: the characters that are commands.
         on_press: called with the key and the state that the browser displayed when the key was pressed (see `show`).
         fields: maps a key to the CSS selector of the field that it moves the focus to.
-        aliases: maps further keys, such as "pagedown", to those commands; "enter" only while no button has the focus.
+        aliases: maps further keys, such as "pagedown" or "enter", to those commands.
 
-    The space bar and Enter act as usual on elements inside one with the attribute ``data-own-keys``.
+    The space bar and Enter press the button or link that has the focus; a click by mouse or finger leaves none there.
     """
 
     def __init__(
@@ -107,6 +107,9 @@ To add a page, add a line here and a folder ``pages/<name>`` with a module ``<na
 ``show(page)`` adds the content below the title. The folder's ``__init__`` holds its `PageTexts` as ``TEXTS``.
 """
 
+CHILD = "child"
+"""Value of ``view`` in the address of a screen for a child, which has nothing to press."""
+
 TOUR = "tour"
 """Query parameter of the address with which a page shows its sentences of the tour."""
 
@@ -135,6 +138,8 @@ E = TypeVar("E", bound=ui.element)
 Kind = Literal["info", "good", "warning", "error"]
 
 _CSS = Path(__file__).with_name("studio.css")
+# The browser has drawn what was sent before.
+_DRAWN_MS = 60
 
 
 def page_texts(name: str) -> PageTexts:
@@ -145,13 +150,19 @@ def page_texts(name: str) -> PageTexts:
 
 @dataclass
 class Page:
-    """An open page: its workspace, its texts, and the place where messages appear."""
+    """An open page: its workspace, its texts, and the places where messages and the progress of jobs appear."""
 
     workspace: Workspace
     name: str
     words: Words
     dark: bool
+    work: ui.element | None = None
     _messages: Any = None
+
+    def show_work(self) -> None:
+        """Reveal the progress of the job that was just started."""
+        if self.work is not None:
+            reveal(self.work)
 
     def say(
         self, sentence: str, kind: Kind = "info", undo: Callable[[], Any] | None = None, label: str = "Undo"
@@ -217,13 +228,19 @@ def visitor() -> tuple[Words, bool | None]:
 
 @contextmanager
 def frame(workspace: Workspace, name: str) -> Iterator[Page]:
-    """Build the navigation bar and title of the page ``name`` (a key of `PAGES`), and yield the page to fill."""
+    """Build the navigation bar and title of the page ``name`` (a key of `PAGES`), and yield the page to fill.
+
+    A screen for a child has neither, nor a place for messages.
+    """
     words, dark = visitor()
     texts = page_texts(name)
     page = Page(workspace, name, words, bool(dark))
     _set_appearance(words, dark)
     ui.page_title(f"{words(texts.name)} · PlushSense")
     add_style(_CSS.read_text(encoding="utf-8"))
+    if query().get("view") == CHILD:
+        yield page
+        return
     with ui.header().classes("ps-header items-center no-wrap"):
         # Written as HTML because a link made by NiceGUI would reload the page.
         html(Markup('<a class="ps-skip" href="#content">{}</a>').format(words("Skip to the content")))
@@ -498,3 +515,10 @@ def icon_button(
 def focus(element: ui.element) -> None:
     """Move the keyboard focus to an element as soon as it is displayed."""
     ui.run_javascript(f"setTimeout(() => getHtmlElement({element.id})?.focus())")
+
+
+def reveal(element: ui.element) -> None:
+    """Scroll to the effect of a click as soon as it is displayed, and move the keyboard focus there."""
+    at = f"const at = getHtmlElement({element.id})"
+    go = "if (at) { at.tabIndex = -1; at.focus({ preventScroll: true }); at.scrollIntoView(); }"
+    ui.run_javascript(f"setTimeout(() => {{ {at}; {go} }}, {_DRAWN_MS})")

@@ -100,9 +100,11 @@ class Words:
         """Format a number with so many significant digits and the decimal separator of this language."""
         return f"{value:.{digits}g}".replace(".", self.decimal_point)
 
-    def count(self, value: int) -> str:
-        """Format a whole number with the thousands separator of this language."""
-        return f"{value:,}".replace(",", self._group)
+    def count(self, value: float) -> str:
+        """Format a whole number with the thousands separator of this language, and any other with one decimal."""
+        if value != int(value):
+            return self.number(value, 1)
+        return f"{int(value):,}".replace(",", self._group)
 
     def names(self, kind: str) -> dict[str, str]:
         """Return the translated names of a kind of thing, "gesture" or "channel", by their English names."""

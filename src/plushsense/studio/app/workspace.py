@@ -30,7 +30,7 @@ PROTOCOLS = "protocols"
 PATTERNS = "patterns"
 """Folder of the patterns by which files of other sensors are read."""
 VIRTUAL = "virtual://?person=7"
-_HEAD, _INDEX = "dataset.toml", "recordings.csv"
+_HEAD = "dataset.toml"
 _BUNDLE = "*.plush"
 _COPY = "~~"  # before the number of a second discarded file of the same name
 _NOT_PLAIN = re.compile(r"[^\w .-]")
@@ -175,7 +175,7 @@ class Workspace:
                 raise ConfigError(
                     "“{name}” exists already. Give another name; nothing is replaced.", name=name, field="name"
                 )
-            self._check_name(name)
+            self.check_name(name)
             change_head(real, lambda head: replace(head, name=name))
             return real
         place = self.new(BUNDLES, f"{name}{real.suffix}")
@@ -241,7 +241,7 @@ class Workspace:
         Raises:
             ConfigError: if ``name`` is not a plain file name, or exists already.
         """
-        plain = self._check_name(name)
+        plain = self.check_name(name)
         place = self.inside(Path(kind) / plain)
         if place.exists():
             raise ConfigError(
@@ -250,10 +250,13 @@ class Workspace:
         return place
 
     @staticmethod
-    def _check_name(name: str) -> str:
+    def check_name(name: str) -> str:
+        """Return ``name`` without outer spaces; raise ConfigError if it is not a plain file name."""
         plain = name.strip()
         dotted = plain.startswith(".") or plain.endswith(".")
-        if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain) or DEVICE_NAME.match(plain):
+        if DEVICE_NAME.match(plain):
+            raise ConfigError("“{name}” is reserved by Windows. Give another name.", name=plain, field="name")
+        if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain):
             raise ConfigError(
                 "“{name}” cannot be a name. Use at most 64 letters, digits, spaces, points and hyphens.",
                 name=name,
@@ -261,24 +264,19 @@ class Workspace:
             )
         return plain
 
-    def dataset_for(self, layout: str, simulated: bool, name: str = RECORDINGS) -> Path:
-        """Return the folder of the data set to which recordings can be added, the last changed one of several.
+    def fitting(self, layout: str, simulated: bool) -> list[Path]:
+        """Return the data sets to which recordings of a layout can be added.
 
         Args:
-            layout: name of the layout of the recordings.
             simulated: whether the toy was a virtual one; real and simulated recordings are never mixed.
-            name: the name of a new data set.
-
-        Returns:
-            The path of a new data set if none fits.
         """
         fitting = []
         for path in self.datasets():
             with contextlib.suppress(PlushSenseError, OSError):
                 head = DatasetHead.read(path)
                 if (head.layout.name, head.simulated) == (layout, simulated):
-                    fitting.append(((path / _INDEX).stat().st_mtime, path))
-        return max(fitting)[1] if fitting else self.folder / DATASETS / self.free_name(DATASETS, name)
+                    fitting.append(path)
+        return fitting
 
     def free_name(self, kind: str, name: str, *suffixes: str, separator: str = "-", taken: Collection[str] = ()) -> str:
         """Return ``name``, numbered if it is in ``taken`` or exists in ``folder / kind`` with one of ``suffixes``."""

@@ -69,11 +69,6 @@ def style() -> None:
     add_style(_CSS.read_text(encoding="utf-8"))
 
 
-def scroll_to(name: str) -> None:
-    """Scroll to the element with this name (see `tag`)."""
-    ui.run_javascript(f"document.querySelector('[data-test=\"{name}\"]')?.scrollIntoView()")
-
-
 def text(message: str, kind: str = "p", classes: str = "") -> ui.html:
     """Add plain text as an HTML element."""
     return html(message, kind).classes(classes)
@@ -345,6 +340,10 @@ class Plot(Element, component="plot.js"):
         """Replace all curves and, if given, the series; None in a curve is a gap."""
         self.run_method("show", [list(x), *map(list, curves)], series)
 
+    def enlarge(self, on: bool) -> None:
+        """Scale a live plot by what it shows, instead of the range of all samples so far."""
+        self.run_method("enlarge", on)
+
     def push(self, x: Sequence[float], curves: Sequence[Sequence[float]]) -> None:
         """Append samples at the right end of a live plot, and drop those that leave its window."""
         self.run_method("push", list(x), [list(c) for c in curves])
@@ -425,7 +424,7 @@ class WorkPanel:
         self._closed: set[str] = set()
         self._state: tuple[Any, ...] | None = None
         self._bars: dict[str, tuple[ui.linear_progress, ui.label]] = {}
-        self._box = tag(ui.column().classes("ps-work w-full"), "work")
+        self._box = page.work = tag(ui.column().classes("ps-work w-full"), "work")
         # Parent element for timers, because the box is cleared.
         self._after = ui.element("div").classes("hidden")
         on_change(self._jobs.changed, self.refresh)
@@ -443,6 +442,7 @@ class WorkPanel:
         assert job is not None
         self._watched.add(job.id)
         self.refresh()
+        self._page.show_work()
         return job
 
     def refresh(self) -> None:

@@ -2,6 +2,8 @@
 import { loadResource } from "../../static/utils/resources.js";
 
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim() || "#555";
+// Least height of a live plot in mean steps between samples, and the samples that are enough to know these.
+const NOISES = 40, ENOUGH = 50;
 
 export default {
   template: '<div role="img" :aria-label="label"><div ref="place"></div></div>',
@@ -13,6 +15,7 @@ export default {
     await this.$nextTick();
     const at = window.path_prefix + this.resourcePath;
     await Promise.all([loadResource(`${at}/uPlot.min.css`), loadResource(`${at}/uPlot.iife.min.js`)]);
+    this.$el.psPlot = this;
     this.curves = this.series;
     this.kept = this.start || [[], ...this.series.map(() => [])];
     this.build();
@@ -51,7 +54,7 @@ export default {
       const options = {
         width: this.$el.clientWidth || 600,
         height: this.height,
-        legend: { live: false },
+        legend: { live: false, markers: { fill: (u, i) => u.series[i].stroke(u, i) } },
         cursor: { drag: { x: false, y: false } },
         scales: { x: { time: false }, ...(this.share ? { y: { range: [0, 1] } } : {}) },
         axes: [axis(this.xTitle, 44), axis(this.yTitle, 64)],
@@ -95,16 +98,31 @@ export default {
         this.scaleY();
       });
     },
+    enlarge(on) {
+      this.enlarged = on;
+      if (this.u && this.kept[0].length) this.scaleY();
+    },
     scaleY() {
-      let low = Infinity, high = -Infinity;
+      let low = Infinity, high = -Infinity, steps = 0;
       for (let i = 1; i < this.kept.length; i++) {
         if (this.u.series[i].show === false) continue;
-        for (const v of this.kept[i]) {
-          if (v < low) low = v;
-          if (v > high) high = v;
+        const values = this.kept[i];
+        let moved = 0;
+        for (let j = 0; j < values.length; j++) {
+          if (values[j] < low) low = values[j];
+          if (values[j] > high) high = values[j];
+          if (j) moved += Math.abs(values[j] - values[j - 1]);
         }
+        steps = Math.max(steps, moved / values.length);
       }
       if (low > high) return;
+      if (!this.enlarged && this.windowS > 0) {
+        // The range of the session so far, and many times the noise: at rest, the curves are flat.
+        if (this.kept[0].length > ENOUGH) this.noise = Math.min(this.noise ?? Infinity, steps);
+        const middle = (low + high) / 2, least = (NOISES * (this.noise ?? steps)) / 2;
+        low = this.low = Math.min(this.low ?? low, low, middle - least);
+        high = this.high = Math.max(this.high ?? high, high, middle + least);
+      }
       const pad = 0.05 * (high - low || 1);
       this.u.setScale("y", { min: low - pad, max: high + pad });
     },

@@ -18,7 +18,18 @@ from plushsense.deploy.targets import TARGETS
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import download_address, path_in
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, button, html, moment, query, query_path, set_address, tag
+from plushsense.studio.app.shell import (
+    Page,
+    address,
+    button,
+    html,
+    moment,
+    query,
+    query_path,
+    reveal,
+    set_address,
+    tag,
+)
 from plushsense.studio.app.stored_results import StoredResults, recommended
 from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import EXPORTS, plain_name
@@ -29,7 +40,6 @@ from plushsense.studio.widgets.elements import (
     facts,
     link,
     notice,
-    scroll_to,
     size,
     style,
     summary,
@@ -222,10 +232,11 @@ class VerificationCard:
         self.page, self.words, self.work, self.export = page, page.words, work, export
         self._chosen: dict[str, ui.checkbox] = {}
 
-    async def build(self) -> None:
+    async def build(self) -> ui.element:
+        """Build the card, and return the element of its outcome."""
         words = self.words
         missing = await run.io_bound(targets) or {}
-        with tag(ui.column().classes("ps-card w-full"), "proof"):
+        with tag(ui.column().classes("ps-card w-full"), "proof") as card:
             text(words(in_context("heading", "Verify")), "h3")
             about = words(
                 "The C code in this folder is compiled and run if it is exactly what this version of PlushSense writes "
@@ -256,8 +267,7 @@ class VerificationCard:
             start = button("verify", words("Verify"), self._start, "", icon="fact_check")
             start.set_enabled(bool(self._chosen))
             proof = newest_job(self.page.workspace.part(Jobs), "verify", self.export.folder)
-            if proof is not None:
-                self._display(proof)
+            return card if proof is None else self._display(proof)
 
     def _title(self, name: str) -> str:
         return self.words("This computer (gcc, clang, sanitizers)") if name == "host" else TARGETS[name].title
@@ -281,9 +291,9 @@ class VerificationCard:
             }
             await self.work.start("verify", spec)
 
-    def _display(self, proof: StudioJob) -> None:
+    def _display(self, proof: StudioJob) -> ui.element:
         words, result = self.words, proof.result
-        with tag(ui.column().classes("w-full"), "verdict"):
+        with tag(ui.column().classes("w-full"), "verdict") as box:
             if result["digest"] != self.export.digest:
                 when = moment(proof.ended_s)
                 notice(words("The files have changed since this verification of {when}. Verify again.", when=when))
@@ -318,6 +328,7 @@ class VerificationCard:
             for each in result["not_run"]:
                 why = words.sentence(each["why"])
                 text(words("Not run: {what} ({why}).", what=each["what"], why=why), classes="ps-dim")
+        return box
 
     def _sum(self, result: dict[str, Any]) -> str:
         total, unequal = result["vectors"], result["mismatches"]
@@ -509,13 +520,13 @@ class _Exporting:
             self.page.say(self.words("“{name}” is exported. Verify it before it goes into a toy.", name=name), "good")
             self._name.set_value(self._free_name(name))
         if job.task == "export" or name == self.open:
-            await self._show(name)
-            scroll_to("verdict" if job.task == "verify" else "detail")
+            await self._show(name, proof=job.task == "verify")
         await self._refresh_list()
 
     # One export -----------------------------------------------------------------------------------------------
 
-    async def _show(self, name: str) -> None:
+    async def _show(self, name: str, proof: bool = False) -> None:
+        """Show the details of an export, and reveal them or, with ``proof``, the outcome of its verification."""
         words = self.words
         with self.page.show_errors():
             folder = path_in(self.workspace, EXPORTS, name)
@@ -535,6 +546,7 @@ class _Exporting:
                 text(words("Export “{name}”", name=name), "h2")
                 if export.problem:
                     notice(words.sentence(export.problem), "error")
+                    reveal(self._detail)
                     return
                 show_facts(
                     self.page,
@@ -542,8 +554,9 @@ class _Exporting:
                     made if made and made.result.get("profile", {}).get("digest") == export.digest else None,
                 )
                 show_cost(self.page, self.work, export, counted)
-                await VerificationCard(self.page, self.work, export).build()
+                card = await VerificationCard(self.page, self.work, export).build()
                 show_next(self.page)
+            reveal(card if proof else self._detail)
 
     # All exports ----------------------------------------------------------------------------------------------
 

@@ -85,6 +85,7 @@ class DatasetSection:
         with self._page.show_errors():
             title = self._page.words("Checking “{name}”", name=entry.name)
             self._jobs.start("check", {"dataset": str(entry.path), "name": entry.name}, title)
+            self._page.show_work()
 
     def _backup(self, entry: DatasetEntry) -> None:
         """Start to write a backup, named after the data set and the day."""
@@ -94,6 +95,7 @@ class DatasetSection:
             place = workspace.folder / BACKUPS / f"{workspace.free_name(BACKUPS, stem, '.zip', separator=' ')}.zip"
             spec = {"dataset": str(entry.path), "place": str(place), "name": entry.name}
             self._jobs.start("backup", spec, self._page.words("Backup of “{name}”", name=entry.name))
+            self._page.show_work()
 
     def _show_backups(self, backups: Sequence[Path]) -> None:
         page, words = self._page, self._page.words
@@ -119,6 +121,7 @@ class DatasetSection:
         name = workspace.free_name(DATASETS, path.stem, separator=" ")
         spec = {"file": str(path), "dest": str(workspace.new(DATASETS, name)), "name": name, "readmit": readmit}
         self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))
+        self._page.show_work()
 
     async def _discard(self, path: Path) -> None:
         workspace = self._page.workspace

@@ -10,7 +10,17 @@ from nicegui import run, ui
 from plushsense.core.errors import PlushSenseError
 from plushsense.devices.opening import check_address, parse_url
 from plushsense.studio.app.shell import STOP_USE, Kind, Page, button, message_row, on_change, on_page, tag
-from plushsense.studio.app.toys import PERSONS, ToyInUseError, Toys, ToyTrial, ToyUse, described, with_layout
+from plushsense.studio.app.toys import (
+    PERSONS,
+    ToyInUseError,
+    Toys,
+    ToyTrial,
+    ToyUse,
+    described,
+    found_title,
+    toy_title,
+    with_layout,
+)
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.home.sections import SMALL, simulation_badge, titled_card
 from plushsense.studio.widgets.elements import errors_beside
@@ -89,7 +99,7 @@ class ToySection:
                 ui.label(words("No toy is chosen yet.")).classes("ps-dim")
                 return
             with ui.row().classes("items-center ps-small-gap"):
-                tag(ui.label(words("Chosen: {url}", url=toy)).classes("ps-break text-bold"), "chosen")
+                tag(ui.label(words("Chosen: {toy}", toy=toy_title(words, toy))).classes("ps-break text-bold"), "chosen")
                 if self._toys.simulated:
                     simulation_badge(self._page)
             if trial is not None:
@@ -123,22 +133,23 @@ class ToySection:
         assert result is not None
         values: dict[str, Any] = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
         key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
-        values |= {"frames": result.frames, "layout": result.layout, "malformed": result.malformed}
+        values |= {"frames": str(result.frames), "layout": result.layout, "malformed": str(result.malformed)}
         return ("good" if key == "good" else "warning"), words(_TESTS[key], **values)
 
     def _show_others(self) -> None:
         words, toys = self._words, self._toys
         self._others.clear()
-        given = [(url, "", words("given when the studio was started")) for url in self._page.workspace.devices]
+        since = words("given when the studio was started")
+        given = [(url, toy_title(words, url), since) for url in self._page.workspace.devices]
         found = [d for d in toys.listing.devices if d.kind != "virtual"]
-        listed = [(d.url, d.name, described(words, d)) for d in found]
+        listed = [(d.url, found_title(words, d), described(words, d)) for d in found]
         with self._others:
             for url, name, about in [*given, *listed]:
                 with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):
                     with ui.column().classes("ps-no-gap"):
-                        ui.label(name or url).classes("ps-break")
-                        ui.label(" · ".join(t for t in (url if name else "", about) if t)).classes("ps-dim ps-break")
-                    button("", words("Choose"), on_page(lambda url=url: self._choose(url)), SMALL, about=name or url)
+                        ui.label(name).classes("ps-break")
+                        ui.label(about).classes("ps-dim ps-break")
+                    button("", words("Choose"), on_page(lambda url=url: self._choose(url)), SMALL, about=name)
             if toys.searching:
                 with ui.row().classes("items-center ps-small-gap").props('role="status"'):
                     ui.spinner(size="1.2em").props("aria-hidden=true")

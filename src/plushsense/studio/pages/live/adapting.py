@@ -14,7 +14,7 @@ from nicegui import ui
 from plushsense.core.errors import BadInput, ConfigError, DatasetError, PlushSenseError
 from plushsense.core.recorder_csv import parse_name
 from plushsense.experiments.adaptation import adapt
-from plushsense.live.adaptation import Personal
+from plushsense.live.adaptation import Personal, PersonalSpec
 from plushsense.models.bundle import Bundle
 from plushsense.recording.session import check_subject
 from plushsense.studio.app.shell import Page, button, named, on_change, tag
@@ -115,10 +115,14 @@ class PersonFields:
         self._fields: list[ui.input] = []
         self.code = reader.subject
 
-    def add(self, name: str, on_change: Callable[[], None] = lambda: None) -> ui.input:
-        """Add a field; ``on_change`` is called when the text of any field has changed."""
+    def add(self, name: str, about: str, on_change: Callable[[], None] = lambda: None) -> ui.input:
+        """Add a field; ``on_change`` is called when the text of any field has changed.
+
+        Args:
+            about: what the code is used for; screen readers read it after the label.
+        """
         field = ui.input(self._page.words("Code of the person"), value=self.code, placeholder="S01")
-        tag(field.props("maxlength=16"), name)
+        tag(named(field, f"{self._page.words('Code of the person')}: {about}").props("maxlength=16"), name)
         self._fields.append(field)
 
         def changed() -> None:
@@ -164,9 +168,10 @@ class _AdaptingPanel:
         self._adapting = page.workspace.part(Adapting)
         self._busy = False
         words = page.words
-        ui.label(words("Adapt the network to a person")).classes("text-bold")
+        title = words("Adapt the network to a person")
+        ui.label(title).classes("text-bold")
         with ui.row().classes("w-full items-center ps-small-gap"):
-            self._person = people.add("adapt-person", self._update).style("flex: 1 1 9rem")
+            self._person = people.add("adapt-person", title, self._update).style("flex: 1 1 9rem")
             self._recordings = tag(ui.select({}, label=words("Recordings of the person")), "adapt-from")
             self._recordings.style("flex: 1 1 15rem; min-width: 0")
             self._adapt = button("adapt", words("Adapt to these recordings"), self._run, icon="auto_fix_high")
@@ -190,6 +195,9 @@ class _AdaptingPanel:
                 own = done.personal
                 scores = {"n": own.before.recordings, "before": own.before.right, "after": own.after.right}
                 outcome = words(_OUTCOMES[own.refusal or "gain"], **scores)
+                if own.without:
+                    few = {"n": PersonalSpec().least, "gestures": ", ".join(map(words.gesture, own.without))}
+                    outcome += f" {words('Fewer than {n} recordings, so unchanged: {gestures}.', **few)}"
                 if done.name:
                     names = {"name": done.name, "before": done.before.stem, "subject": subject}
                     message = words(

@@ -37,17 +37,20 @@ SIMULATIONS: Texts = {
 """Sentences on what is virtual, by `plushsense.studio.pages.live.live_state.SimulationKind`."""
 
 
-def log_table(events: Sequence[EventSpan]) -> Table:
-    """Return a table with one row for each event, for a file."""
+_SOURCES: Texts = {"cnn": "network", "gate": "rules"}
+
+
+def log_csv(words: Words, events: Sequence[EventSpan]) -> str:
+    """Return the log as a CSV file that spreadsheets in the language of ``words`` open, with a row for each event."""
     rows = [
         {
             "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(event.at)),
-            "toy_s": round(event.begin_s, 2),
-            "lasted_s": None if event.end_s is None else round(event.end_s - event.begin_s, 2),
+            "toy_s": words.number(event.begin_s, 2),
+            "lasted_s": "" if event.end_s is None else words.number(event.end_s - event.begin_s, 2),
             "gesture": event.gesture or "",
             "affect": event.affect,
-            "confidence": None if event.confidence is None else round(event.confidence, 3),
-            "source": event.source,
+            "confidence": "" if event.confidence is None else words.number(event.confidence, 3),
+            "source": words(_SOURCES.get(event.source, event.source)),
             "eyes": event.eyes,
             "sound": event.sound,
             "really": "" if event.really is None else event.really or "nothing",
@@ -57,7 +60,8 @@ def log_table(events: Sequence[EventSpan]) -> Table:
         }
         for event in events
     ]
-    return Table.from_rows("log", "", rows)
+    # With the mark at the beginning, spreadsheets read the letters as UTF-8.
+    return "\ufeff" + Table.from_rows("log", "", rows).csv(separator=";" if words.decimal_point == "," else ",")
 
 
 def printed(words: Words, events: Sequence[EventSpan]) -> Markup:
@@ -141,7 +145,7 @@ class LogButtons:
         events = self._events()
         people = sorted({event.subject for event in events if event.subject})
         name = "-".join(["live", time.strftime("%Y-%m-%d-%H%M", time.localtime(events[0].session)), *people])
-        ui.download.content(log_table(events).csv(), f"{plain_name(name, 'live')}.csv", "text/csv")
+        ui.download.content(log_csv(self._page.words, events), f"{plain_name(name, 'live')}.csv", "text/csv")
 
     def _open_print(self) -> None:
         self._sheet.set_content(printed(self._page.words, self._events()))

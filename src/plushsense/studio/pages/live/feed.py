@@ -25,6 +25,7 @@ VIEW_TEXTS: Texts = {
     "signals": "Signals",
     "signals_label": "The {n} signals of the toy over the last {s} seconds, one lane each",
     "unit_count": "counts",
+    "enlarge": "Enlarge small changes",
     "now": "Now",
     "timeline": "Events",
     "timeline_label": "The events of the last minute; the list below describes them in words",

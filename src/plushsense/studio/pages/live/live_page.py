@@ -274,7 +274,7 @@ class _Controls:
             control.set_enabled(not running)
         choice = reader.choice
         now = (
-            f": {self._recordings.get(choice.toy, choice.toy)} · {choice.bundle.stem}"
+            f": {self._recordings.get(choice.toy) or toy_title(words, choice.toy)} · {choice.bundle.stem}"
             if running and choice.bundle is not None
             else ""
         )
@@ -283,7 +283,7 @@ class _Controls:
         rates = words(
             "These two change only this page. The network itself answers {n} times a second, and neither events nor "
             "reactions wait for the page.",
-            n=words.number(1.0 / step_s),
+            n=round(1.0 / step_s),
         )
         self._rates.set_text(rates)
         self._follow()

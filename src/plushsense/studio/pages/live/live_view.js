@@ -38,6 +38,7 @@ const CSS = `
 .lv > section { border: 1px solid var(--ps-line); border-radius: 10px; padding: 12px 14px; min-width: 0; }
 .lv [hidden] { display: none; } .lv h2 { margin-bottom: 8px; } .lv .lv-wide { grid-column: 1 / -1; }
 .lv summary { cursor: pointer; } .lv summary h2 { display: inline; margin: 0; }
+.lv-check { display: inline-flex; align-items: center; gap: 8px; min-height: 44px; cursor: pointer; } .lv-check input { width: 24px; height: 24px; }
 .lv canvas { display: block; width: 100%; margin-top: 8px; }
 .lv-now { display: grid; gap: 16px 24px; grid-template-columns: minmax(0, 1.25fr) minmax(0, 1fr); align-items: start; }
 .lv-top { display: flex; gap: 20px; align-items: center; min-width: 0; } .lv-top > :last-child { min-width: 0; }
@@ -170,7 +171,13 @@ export default {
       n.signals.setAttribute("role", "img");
       n.latency = el("p", "lv-dim");
       n.latency.dataset.test = "latency";
-      n.fold.append(n.signals, n.latency);
+      const label = el("label", "lv-check");
+      this.enlarge = el("input");
+      this.enlarge.type = "checkbox";
+      this.enlarge.dataset.test = "enlarge";
+      this.enlarge.addEventListener("change", () => { this.range = this.range.map(() => null); this.paint(); });
+      label.append(this.enlarge, ` ${w.enlarge}`);
+      n.fold.append(label, n.signals, n.latency);
       this.$el.append(root);
     },
     inks() {
@@ -200,6 +207,7 @@ export default {
       this.xs = [];
       this.ys = this.channels.map(() => []);
       this.range = this.channels.map(() => null);
+      this.noise = this.channels.map(() => Infinity);
       this.spans = this.stats.spans = new Map();
       this.did = [];
       this.t = 0;
@@ -369,9 +377,20 @@ export default {
         const value = (ys[ys.length - 1] * channel.step - channel.offset) * channel.scale;
         c.fillStyle = k.dim;
         c.fillText(`${this.digits.format(value)} ${channel.unit === "count" ? this.words.unit_count : channel.unit}`, 0, mid + 13);
-        // A lane keeps its scale until the signal leaves it or has long been small in it.
-        const kept = this.range[i], span = Math.max(high - low, 8);
-        if (!kept || low < kept[0] || high > kept[1] || kept[1] - kept[0] > 3 * span) this.range[i] = [low - 0.15 * span, high + 0.15 * span];
+        // A lane has the range of the session so far, and many times the noise: at rest it is flat. Enlarged, it keeps its
+        // scale until the signal leaves it or has long been small in it.
+        let kept = this.range[i], span = Math.max(high - low, 8), moved = 0;
+        if (!this.enlarge.checked) {
+          for (let j = from + 1; j < ys.length; j++) moved += Math.abs(ys[j] - ys[j - 1]);
+          if (ys.length - from > 50) this.noise[i] = Math.min(this.noise[i], moved / (ys.length - from));
+          const middle = (low + high) / 2, least = Number.isFinite(this.noise[i]) ? 20 * this.noise[i] : 0;
+          low = Math.min(low, middle - least);
+          high = Math.max(high, middle + least);
+          if (kept && (low < kept[0] || high > kept[1])) kept = [Math.min(low, kept[0]), Math.max(high, kept[1])];
+          this.range[i] = kept ?? [low, high];
+        } else if (!kept || low < kept[0] || high > kept[1] || kept[1] - kept[0] > 3 * span) {
+          this.range[i] = [low - 0.15 * span, high + 0.15 * span];
+        }
         const [a, b] = this.range[i], y = (v) => top + 3 + (1 - (v - a) / (b - a)) * (lane - 6);
         c.strokeStyle = k.line;
         c.beginPath();

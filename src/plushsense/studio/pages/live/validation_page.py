@@ -14,13 +14,13 @@ from nicegui import ui
 from plushsense.experiments.protocol.run_protocol import PAGE, TABLE, TRIALS
 from plushsense.experiments.protocol.score import NAMELESS, NOTES
 from plushsense.studio.app.choices import Choices
-from plushsense.studio.app.shell import Page, button, html, moment, on_change, section, tag
+from plushsense.studio.app.shell import Page, button, html, moment, on_change, reveal, section, tag
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.live.adapting import PersonFields
 from plushsense.studio.pages.live.event_log import SIMULATIONS
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.validation import FOLDER, Validation
-from plushsense.studio.widgets.elements import notice, picture, scroll_to, summary, table
+from plushsense.studio.widgets.elements import notice, picture, summary, table
 
 _HEADS: Texts = {
     "rules_answered": "Rules: answered",
@@ -80,7 +80,7 @@ class _ValidationPanel:
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         self._form = ui.row().classes("w-full items-start ps-small-gap")
         with self._form:
-            self._person = people.add("validation-person").classes("w-64")
+            self._person = people.add("validation-person", words("Live validation with a new person")).classes("w-64")
             times = {n: words("{n} times", n=n) if n > 1 else words("once") for n in (3, 2, 1)}
             self._repetitions = ui.select(times, value=3, label=words("Each gesture")).classes("w-36")
             tag(self._repetitions, "validation-times")
@@ -139,7 +139,7 @@ class _ValidationPanel:
             await asyncio.to_thread(
                 self._validation.begin, subject, int(self._repetitions.value), tune_on, self._noted.value
             )
-            scroll_to("validation")
+            reveal(self._prompts)
 
     def _update_button(self) -> None:
         self._begin.set_enabled(self._reader.now.running)

@@ -24,7 +24,7 @@ from plushsense.dataset.publishing.keys import is_drawn
 from plushsense.dataset.store import Dataset
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, button, html, moment, set_address, tag
+from plushsense.studio.app.shell import Page, address, button, html, moment, reveal, set_address, tag
 from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import PACKAGES, Workspace
 from plushsense.studio.widgets.elements import WorkPanel, ask, change_files, link, notice, size, table, text, verdict
@@ -256,6 +256,7 @@ class PackagesSection:
                     for sentence in reidentification_text(words, package.reidentification):
                         text(sentence)
                 self._contents(package)
+            reveal(self._detail)
 
     def _take(self, package: PackageFacts) -> None:
         words = self.words

@@ -15,7 +15,7 @@ from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
 from plushsense.studio.pages.publish.statements import StatementsForm, ask_again, beside, watched
-from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_to, style, text, titles
+from plushsense.studio.widgets.elements import WorkPanel, facts, notice, style, text, titles
 
 _STAGE_TEXTS: Texts = {
     "begin": "Starting …",
@@ -252,4 +252,3 @@ class _Publishing:
                 self._name.set_value(self._free_name(name))
         await self.packages.show(name.removesuffix(".zip") if job.task == "validate" else name)
         await self.packages.refresh()
-        scroll_to("package")

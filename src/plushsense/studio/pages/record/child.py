@@ -60,8 +60,6 @@ def gesture_picture(page: Page, gesture: str) -> Markup:
     return picture(gesture, name)
 
 
-CHILD = "child"
-"""Value of ``view`` in the address of the child's screen."""
 _DRAW_S = 0.1
 _RESTING = ("finished", "stopped")
 
@@ -83,7 +81,6 @@ class _ChildView:
     def __init__(self, page: Page, controller: RecordController, name: str) -> None:
         self._page, self._controller, self._name = page, controller, name
         self._drawn: str | None = None
-        # It covers the frame of the page, of which a child needs nothing.
         with tag(ui.element("div").classes("ps-child").props("role=main"), "child"):
             self._picture = tag(html(), "child-picture")
             self._gesture = tag(html("", "h1"), "child-gesture")
@@ -100,12 +97,17 @@ class _ChildView:
         if gesture != self._drawn:
             self._drawn = gesture
             self._picture.content = gesture_picture(self._page, gesture)
-            self._gesture.content = words.gesture(gesture) if gesture else words("Thank you!")
+        self._gesture.content = words.gesture(gesture) if gesture else self._resting_text(s)
         self._prompt.text = "" if s is None or rests else s.step.prompt
         self._prompt.set_visibility(bool(self._prompt.text))
         self._state.text = self._state_text(s)
         self._state.set_visibility(bool(self._state.text))
         self._state.props(f'data-state="{s.state if s is not None else "ended"}"')
+
+    def _resting_text(self, s: RecorderStatus | None) -> str:
+        if s is None and not self._controller.exists(self._name):
+            return self._page.words("The session {name} has not begun.", name=self._name)
+        return self._page.words("Thank you!")
 
     def _state_text(self, s: RecorderStatus | None) -> str:
         if s is None:

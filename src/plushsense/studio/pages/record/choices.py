@@ -7,15 +7,15 @@ from pathlib import Path
 
 from nicegui import run, ui
 
-from plushsense.core.errors import PlushSenseError
-from plushsense.core.gestures import load_gestures
+from plushsense.core.errors import ConfigError, PlushSenseError
+from plushsense.core.gestures import AFFECTS, load_gestures, plain_label
 from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import ORDERS
 from plushsense.studio.app.shell import Page, button, named, tag
-from plushsense.studio.app.toys import toy_title
+from plushsense.studio.app.toys import found_title, toy_title
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.controller import RecordController
-from plushsense.studio.widgets.elements import summary
+from plushsense.studio.widgets.elements import errors_beside, on_enter, summary
 
 _ORDERS: Texts = {
     "gesture": "As listed, all repetitions of a gesture in a row",
@@ -78,7 +78,7 @@ class ToyChoice:
         if listing is None:
             return
         options = {u: toy_title(words, u) for u in dict.fromkeys(self._urls)}
-        options |= {d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in options}
+        options |= {d.url: found_title(words, d) for d in listing.devices if d.url not in options}
         self._list.set_options(options, value=self._list.value)
         notes = [words.sentence(note) for note in listing.notes]
         self._page.say(" ".join([words("Toys to choose from: {n}.", n=len(options)), *notes]))
@@ -98,11 +98,20 @@ class ProtocolForm:
             summary(words("Make your own list of gestures"))
             with ui.column().classes("w-full q-pt-sm"):
                 ui.label(words("Gestures to record")).classes("text-bold")
-                with named(ui.row().classes("w-full ps-no-gap").props("role=group"), words("Gestures to record")):
-                    self._gestures = {
-                        label: tag(ui.checkbox(words.gesture(label)).style("width: 16rem"), f"own-{label}")
-                        for label in load_gestures(_GESTURES).labels
-                    }
+                self._group = ui.row().classes("w-full ps-no-gap").props("role=group")
+                named(self._group, words("Gestures to record"))
+                self._gestures: dict[str, ui.checkbox] = {}
+                self._affects = controller.own_gestures()
+                for label in (*load_gestures(_GESTURES).labels, *self._affects):
+                    self._list(label, False)
+                button("own-all", words("Select all"), self._select_all, "flat dense")
+                with ui.row().classes("w-full items-start"):
+                    self._other = tag(ui.input(words("Another gesture, such as kiss")), "own-gesture").classes("w-64")
+                    on_enter(self._other, self._add)
+                    meant = words("How it is meant")
+                    self._affect = ui.select({a: words.affect(a) for a in AFFECTS}, value="positive", label=meant)
+                    named(tag(self._affect.classes("w-64"), "own-affect"), meant)
+                    button("own-add", words("Add this gesture"), self._add)
                 self._lacking = ui.label().classes("ps-bad").props("role=alert")
                 with ui.row().classes("w-full items-start"):
                     self._repetitions = ui.number(
@@ -117,13 +126,35 @@ class ProtocolForm:
                     self._name = tag(ui.input(words("Name of the list")), "own-name").classes("w-64")
                     button("own-save", words("Save and choose it"), self._save)
 
+    def _list(self, label: str, chosen: bool) -> None:
+        with self._group:
+            box = ui.checkbox(self._page.words.gesture(label), value=chosen).style("width: 16rem")
+        self._gestures[label] = tag(box, f"own-{label}")
+
+    def _select_all(self) -> None:
+        """Choose all gestures, or none if all are chosen."""
+        on = not all(box.value for box in self._gestures.values())
+        for box in self._gestures.values():
+            box.value = on
+
+    def _add(self) -> None:
+        """Add the gesture that was typed, chosen; an error is shown beside its field."""
+        with errors_beside(self._page, self._other):
+            label = self._page.workspace.check_name(str(self._other.value or ""))
+            if plain_label(label) in map(plain_label, self._gestures):
+                raise ConfigError("“{gesture}” is in the list already.", gesture=label)
+            self._affects[label] = str(self._affect.value)
+            self._list(label, True)
+            self._other.value = ""
+
     def _save(self) -> None:
         words = self._page.words
         self._name.error, self._repetitions.error, self._lacking.text = None, None, ""
         chosen = [label for label, box in self._gestures.items() if box.value]
-        repetitions = int(self._repetitions.value or 0)
+        own = {label: affect for label, affect in self._affects.items() if label in chosen}
+        name, repetitions = str(self._name.value or ""), int(self._repetitions.value or 0)
         try:
-            path = self._controller.save_protocol(str(self._name.value or ""), chosen, repetitions, self._order.value)
+            path = self._controller.save_protocol(name, chosen, repetitions, self._order.value, own)
         except PlushSenseError as error:
             sentence = words.error(error)
             field = error.message.values.get("field")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from plushsense.core.version import __version__
 from plushsense.devices.lsl import MARKERS, LslMarkers
 from plushsense.devices.opening import is_virtual, parse_url, speed_of, with_speed
 from plushsense.devices.virtual.stream import VirtualDevice
-from plushsense.recording.plan import save_protocol
+from plushsense.recording.plan import load_protocol, save_protocol
 from plushsense.recording.recorder import Recorder, open_toy, prompt_virtual, send_markers
 from plushsense.recording.session import (
     OpenSession,
@@ -134,6 +134,12 @@ class RecordController:
         """Return the active session with this name, or None."""
         with self._lock:
             return self._active.get(name)
+
+    def exists(self, name: str) -> bool:
+        """Return whether there is a session with this name, open or closed."""
+        with contextlib.suppress(PlushSenseError):
+            return self._folder(name).is_dir()
+        return False
 
     def sessions(self) -> list[SessionSummary]:
         """Return all sessions in the studio's folder, newest first."""
@@ -289,14 +295,29 @@ class RecordController:
         """Return the layouts to choose from; keys are names or paths, values are titles."""
         return {n: n for n in layout_names()} | self._own_files(LAYOUTS)
 
-    def save_protocol(self, name: str, gestures: Sequence[str], repetitions: int, order: str) -> Path:
-        """Save a protocol of one's own, and return its path.
+    def own_gestures(self) -> dict[str, str]:
+        """Return the affects of the gestures that the user's own protocols add, by their labels."""
+        affects: dict[str, str] = {}
+        for path in self._own_files(PROTOCOLS):
+            with contextlib.suppress(PlushSenseError):
+                affects |= load_protocol(path).affects
+        return affects
+
+    def save_protocol(
+        self,
+        name: str,
+        gestures: Sequence[str],
+        repetitions: int,
+        order: str,
+        affects: Mapping[str, str] | None = None,
+    ) -> Path:
+        """Save a protocol of one's own (see `plushsense.recording.plan.save_protocol`), and return its path.
 
         Raises:
             ConfigError: for a name that cannot be used or exists, without gestures, or for invalid repetitions.
         """
         place = self._workspace.new(PROTOCOLS, f"{name.strip()}.toml" if name.strip() else "")
-        save_protocol(place, place.stem, gestures, repetitions, order)
+        save_protocol(place, gestures, repetitions, order, affects)
         return place
 
     def _own_files(self, folder: str) -> dict[str, str]:

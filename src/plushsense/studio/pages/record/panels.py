@@ -64,6 +64,7 @@ class SignalPanel:
             with tag(ui.element("details").props("open").classes("w-full"), "live"):
                 summary(words("Sensor signals"))
                 self._plots = self._build(max(1.0, session.request.speed))
+                tag(ui.switch(words("Enlarge small changes"), on_change=self._enlarge), "enlarge")
         rate = self._device.layout.rate_hz * max(1.0, session.request.speed)
         self._place = max(0, self._device.buffer.count - int(_WINDOW_S * rate))
         self._drawn_signal = ""
@@ -96,6 +97,10 @@ class SignalPanel:
                     )
                     plots.append((tag(plot, f"plot-{kind}"), indices))
         return plots
+
+    def _enlarge(self, event: Any) -> None:
+        for plot, _ in self._plots:
+            plot.enlarge(bool(event.value))
 
     def draw(self, s: RecorderStatus) -> None:
         """Display the current signal quality."""
@@ -163,6 +168,8 @@ class StepList:
             if len(steps) > _MAX_STEPS:
                 ui.label(words("There are too many recordings to list. Press b to go back and s to skip."))
                 return
+            signs = {**{key: words(text) for key, text in _STEPS.items()}, "now": words("now")}
+            ui.label(" · ".join(f"{_SIGNS[key]} {text}" for key, text in signs.items())).classes("ps-dim")
             rows: dict[str, list[int]] = {}
             for result in steps:
                 rows.setdefault(result.step.gesture, []).append(result.step.number)

@@ -11,19 +11,18 @@ from nicegui import run, ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from plushsense.core.errors import DatasetError, PlushSenseError
+from plushsense.core.errors import PlushSenseError
 from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import SessionHead
-from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
-from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.shell import CHILD, Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.toys import ToyInUseError
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.record.child import CHILD, ConnectionAlert, gesture_picture, style
+from plushsense.studio.pages.record.child import ConnectionAlert, gesture_picture, style
 from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.last_recording import ResultPanel
 from plushsense.studio.pages.record.panels import SignalPanel, StepList
-from plushsense.studio.widgets.elements import admitting
+from plushsense.studio.widgets.destination import Destination, review_address
 
 _STATES: Texts = {
     "countdown": "GET READY",
@@ -53,33 +52,14 @@ _NOTICES: Texts = {
 }
 
 
-async def collect(page: Page, folder: Path) -> bool:
-    """Import an ended session into a data set that fits, or into a new one; then show its recordings for review.
+def destination_of(page: Page, head: SessionHead) -> Destination:
+    """Add the choice of the data set that the recordings of a session go into."""
+    return Destination(page, str(head.layout["name"]), head.simulated)
 
-    Returns:
-        Whether the import has begun; otherwise it was refused, or asks whether to take the person in.
-    """
-    jobs, words = page.workspace.part(Jobs), page.words
-    head = SessionHead.read(folder)
-    if head is None:
-        raise DatasetError("The folder {name} holds no session.", name=folder.name)
-    place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated, words("recordings"))
-    name = page.workspace.title(place)
 
-    def begin(readmit: bool) -> None:
-        job = jobs.import_sessions([folder], place, words("Import into the data set “{name}”", name=name), readmit)
-        page.say(words("The recordings go into the data set “{name}” …", name=name))
-
-        def follow() -> None:
-            if job.state == DONE:
-                ui.navigate.to(address("review", dataset=place))
-            elif job.state != RUNNING:
-                stopped = words("The recordings were not put into a data set: try it again on the home page.")
-                page.say(words.failure(job.refusal) or stopped, "error")
-
-        on_change(jobs.changed, follow)
-
-    return await admitting(page, begin)
+async def collect(page: Page, folder: Path, destination: Destination) -> bool:
+    """Import an ended session, and then show its recordings for review; return whether the import has begun."""
+    return await destination.put([folder], lambda place: ui.navigate.to(review_address(place, [folder])))
 
 
 _DRAW_S = 0.1
@@ -236,16 +216,15 @@ class _View:
                 self._small[key] = button(name, text).style("min-height: 48px")
                 on_click(self._small[key], partial(self._press, key))
             self._change_toy = button("change-toy", words("Another toy"), self._ask_toy, "flat")
-            # The space bar must not start a recording where it seems to press this button.
-            self._end_button = button("end", words("End the session"), self._ask_end, "flat data-own-keys")
+            self._end_button = button("end", words("End the session"), self._ask_end, "flat")
             for late in (self._change_toy, self._end_button):
                 late.style("min-height: 48px")
-        ending = ui.row().classes("ps-message ps-message-warning w-full items-center").props("data-own-keys")
+        ending = ui.row().classes("ps-message ps-message-warning w-full items-center")
         with tag(ending, "ending") as self._ending:
             self._end_text = ui.label().classes("flex-grow")
             button("end-yes", words("End it"), lambda: self._end(), "unelevated", color="deep-orange-10")
             self._no = button("end-no", words("Stay"), self._stay, color=None)
-        exchange = ui.row().classes("ps-card w-full items-start").props("data-own-keys")
+        exchange = ui.row().classes("ps-card w-full items-start")
         with tag(exchange, "exchange") as self._exchange:
             about = words(
                 "The session goes on with another toy of the same sensor layout. It is tried first. Everything "
@@ -265,6 +244,7 @@ class _View:
         with self._done:
             self._done_text = ui.label().classes("text-bold").style("overflow-wrap: anywhere")
             ui.label(words("Next: look at the recordings. This ends the session and puts them into a data set."))
+            self._destination = destination_of(self._page, self._session.head)
             with ui.row().classes("items-center"):
                 button("collect", words("Look at the recordings"), self._collect, "unelevated")
                 ui.link(words("Go to the home page"), "/").classes("ps-link")
@@ -305,7 +285,7 @@ class _View:
         if text:
             self._session.recorder.note(text)
             self._note.value = ""
-        # Leave the note field, so that the space bar is a command again.
+        # Leave the note field, so that the space bar starts and stops again.
         focus(self._main)
 
     def _ask_end(self) -> None:
@@ -356,7 +336,7 @@ class _View:
 
     async def _collect(self) -> None:
         """End the session, and lead to its recordings."""
-        await self._end(partial(collect, self._page, self._session.recorder.session.folder))
+        await self._end(partial(collect, self._page, self._session.recorder.session.folder, self._destination))
 
     async def _reopen(self) -> None:
         """Resume the session; if that fails, let the button lead to the start page to choose another toy."""
@@ -452,6 +432,8 @@ class _View:
         self._number.set_visibility(bool(number))
         if self._message.text != (message := words.sentence(s.message)):
             self._message.text = message
+            look = "ps-message ps-message-warning"
+            self._message.classes(**{"add" if s.message.template.startswith("Nobody stopped") else "remove": look})
         self._alert.prepare(self._lost_text(s))
         self._box.style(f"background: {colour}")
         self._box.props(f'data-state="{state}"')

@@ -51,7 +51,7 @@ _FILTERS: Texts = {
 }
 
 _DID: Texts = {
-    "trim": "trim",
+    "trim": "setting start and end",
     "untrim": "removing the trim",
     "exclude": "excluding",
     "include": "including again",
@@ -62,6 +62,14 @@ _DID: Texts = {
     "relabel": "setting another gesture",
 }
 
+_DONE: Texts = {
+    "trim": "Starts accepted: {n}.",
+    "exclude": "Excluded: {n}.",
+    "include": "Included again: {n}.",
+    "relabel": "Set to another gesture: {n}.",
+}
+"""What was done to several recordings; the keys are kinds of marks."""
+
 _MAKING: Texts = {
     "suggestions": "Looking for starts: {done} of {of}. You can begin already.",
     "checks": "Checking: {done} of {of} files.",
@@ -70,6 +78,8 @@ _MAKING: Texts = {
 TABLE, ONE, OVERLAY, DURATIONS, STREAM = "table", "one", "overlay", "durations", "stream"
 VIEWS = (TABLE, ONE, OVERLAY, DURATIONS, STREAM)
 WHO_COOKIE = "plushsense_who"
+# Logins that are no person's.
+_ACCOUNTS = ("root", "administrator", "admin", "user")
 _AHEAD = 4
 _LOOK_S = 1.5
 
@@ -198,7 +208,8 @@ class ReviewController:
         self.ends = False
         self.only: dict[str, None] | None = None
         self.title = ""
-        self._query = {k: v for k, v in query.items() if k in ("dataset", "selection")}
+        self.take_back: Callable[[], Any] | None = None
+        self._query = {k: v for k, v in query.items() if k in ("dataset", "selection", "session")}
         self._turn = asyncio.Lock()
         self._rows: object = None
         self._address = ""
@@ -208,12 +219,17 @@ class ReviewController:
         if not only:
             return
         self.only, self.title = {i: None for i in only if i in self.review.infos}, title
-        if not self._query.get("selection"):
+        if not self._is_named:
             self._query |= {"title": title}
         if missing := [i for i in only if i not in self.only]:
             values = {"n": len(missing), "first": missing[0]}
             text = self.words("Linked recordings that are not in this data set: {n}, for example “{first}”.", **values)
             self.page.say(text, "warning")
+
+    @property
+    def _is_named(self) -> bool:
+        """Whether the address names the recordings by a selection or session, and need not list them."""
+        return bool(self._query.get("selection") or self._query.get("session"))
 
     # Building -----------------------------------------------------------------------------------------------------
 
@@ -255,6 +271,8 @@ class ReviewController:
             with tag(ui.row().classes("w-full items-center ps-message ps-message-info"), "selection"):
                 text = words("Only the linked recordings ({n}). {title}", n=len(self.only), title=self.title)
                 ui.label(text).classes("flex-grow")
+                if self.take_back is not None:
+                    button("take-back", words("Undo"), self.take_back, "outline color=inherit", about=self.title)
                 ui.link(words("Show all"), address("review", dataset=review.path)).style("color: inherit")
         self.views = {name: view(self) for name, view in views.items()}
         on_change(review.changed, self.changed)
@@ -318,8 +336,9 @@ class ReviewController:
         request = context.client.request
         name = unquote(request.cookies.get(WHO_COOKIE, "")) if request is not None else ""
         with contextlib.suppress(PlushSenseError):
-            return name or author_name(None)
-        return ""
+            login = author_name(None)
+            return name or ("" if login.lower() in _ACCOUNTS else login)
+        return name
 
     def _keep_who(self, name: str | None) -> None:
         cookie = json.dumps(f"{WHO_COOKIE}={quote(name or '')}; path=/; max-age=31536000; SameSite=Strict")
@@ -463,8 +482,10 @@ class ReviewController:
         async with self._turn:
             with self.page.show_errors():
                 changed = await run.io_bound(decision)
-                what = self.words(_DID[action])
-                text = self.words("Done: {what}. Recordings changed: {n}.", what=what, n=changed or 0)
+                text = self.words(_DONE[action], n=changed or 0)
+                if action == "trim" and (left := sum(not row.done for row in self.review.rows.values())):
+                    rest = "Still to decide: {n}. Choose “{one}” and go through them: Enter accepts, x excludes."
+                    text = f"{text} {self.words(rest, n=left, one=self.words(_VIEWS[ONE]))}"
                 self.page.say(text, "good" if changed else "info", self.undo if changed else None)
                 return True
         return False
@@ -560,7 +581,7 @@ class ReviewController:
         if self.view == STREAM:
             query["stream"] = self.stream
         pairs = list(query.items())
-        if self.only is not None and not query.get("selection"):
+        if self.only is not None and not self._is_named:
             pairs += [("recordings", i) for i in self.only]
         path = f"/review?{urlencode(pairs)}"
         if path != self._address:

@@ -94,7 +94,7 @@ class GestureOverlayView:
             summary,
             [np.round(overlay.x, 4).tolist(), *curves],
             series,
-            x_title=words("Seconds since the first row (grey: outside the recording)"),
+            x_title=words("Seconds (grey: outside the recording)"),
             y_title=words("Deviation from rest (1 = usual)"),
             limits=(0.0, overlay.top),
         )

@@ -63,6 +63,7 @@ class RecordingView:
         self.desk = desk
         self.group = ALL
         self.side = START
+        self.enlarged = False
         self._drawn: Any = None
         words, trims = desk.words, not desk.review.is_labelled
         with tag(ui.element("div").classes("ps-one w-full"), "one") as self.place:
@@ -138,6 +139,8 @@ class RecordingView:
             toggle = ui.toggle({g: self._kind(g) for g in groups}, value=ALL)
             toggle.props(f'no-caps dense unelevated aria-label="{words("Channels shown")}"').classes("ps-toggle")
             tag(toggle, "group").on_value_change(lambda e: self._grouped(str(e.value)))
+            enlarge = ui.switch(words("Enlarge small changes"), on_change=lambda e: self._enlarge(bool(e.value)))
+            tag(enlarge, "enlarge")
             for name, icon, text, factor in (
                 ("zoom_in", "zoom_in", words("Zoom in"), 0.5),
                 ("zoom_out", "zoom_out", words("Zoom out"), 2.0),
@@ -158,7 +161,7 @@ class RecordingView:
         if not identity or identity not in desk.review.infos:
             self.heading.set_text(words("No recording fits the filter."))
             return
-        plotted = desk.review.signals(identity).curves(self.group, low, high)
+        plotted = desk.review.signals(identity).curves(self.group, low, high, self.enlarged)
         series = curve_styles([self._kind(n) if n == ACTIVITY else words.channel(n) for n in plotted.names])
         y_title = words("Value ({unit})", unit=words.unit(plotted.unit)) if plotted.unit else ""
         lanes = [(at, self._kind(kind)) for at, kind in plotted.lanes]
@@ -167,10 +170,10 @@ class RecordingView:
             self._label(),
             [plotted.x, *plotted.curves],
             series,
-            x_title=words("Seconds since the first row (grey: outside the recording)"),
+            x_title=words("Seconds (grey: outside the recording)"),
             y_title=words("Deviation from rest (1 = usual)") if self.group == ACTIVITY else y_title,
             lanes=lanes,
-            limits=(-1.08 - 2.1 * (len(lanes) - 1), 1.08) if lanes else None,
+            limits=plotted.limits,
             marks=self._lines(),
             cut=self._cut(),
             thinned=plotted.thinned or low is not None,
@@ -194,8 +197,8 @@ class RecordingView:
         self._drawn = now
         self.heading.set_text(row.id)
         recorded = recorded_as(words, row)
-        gesture = f"{AFFECT_SIGNS[row.affect]} {words.gesture(row.info.gesture)}"
-        self.affect.set_text(f"{gesture} ({recorded})" if recorded else gesture)
+        gesture = words.gesture(row.info.gesture) + (f" ({recorded})" if recorded else "")
+        self.affect.set_text(f"{AFFECT_SIGNS[row.affect]} {gesture}, {words.affect(row.affect)}")
         self.affect.style(f"background: {AFFECT_COLOURS.get(row.affect, '#767676')}")
         self.state.set_text(f"{SIGNS[row.state]} {words(STATE_TEXTS[row.state])}")
         self.state.props(f'data-state="{row.state}"')
@@ -378,6 +381,10 @@ class RecordingView:
 
     def _grouped(self, group: str) -> None:
         self.group = group
+        self.draw(keep=True)
+
+    def _enlarge(self, enlarged: bool) -> None:
+        self.enlarged = enlarged
         self.draw(keep=True)
 
     def zoomed(self, event: dict[str, Any]) -> None:

@@ -101,7 +101,7 @@ export default {
         width: this.$el.clientWidth || 600,
         height: this.pixels(),
         bands: p.bands || [],
-        legend: { show: this.legend, live: false },
+        legend: { show: this.legend, live: false, markers: { fill: (u, i) => u.series[i].stroke(u, i) } },
         cursor: { drag: { x: this.selects, y: false, setScale: false, dist: 4 }, points: { show: false } },
         scales: { x: { time: false }, y: p.limits ? { range: p.limits } : {} },
         axes: [{ ...counts, values, stroke: ink, grid, ticks: grid, label: p.x_title, labelSize: 22, size: 44 }, y],

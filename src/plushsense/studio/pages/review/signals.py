@@ -43,7 +43,10 @@ _GRID = 240
 
 
 class PlottedCurves(NamedTuple):
-    """Curves to plot: None is a gap, a ``unit`` of "" means scaled values, ``lanes`` are pairs of position and kind."""
+    """Curves to plot: None is a gap, a ``unit`` of "" means scaled values, ``lanes`` are pairs of position and kind.
+
+    ``limits`` of the y-axis are given where those of the values would enlarge small changes.
+    """
 
     x: list[float]
     curves: list[list[float | None]]
@@ -51,6 +54,7 @@ class PlottedCurves(NamedTuple):
     unit: str
     lanes: list[tuple[float, str]]
     thinned: bool
+    limits: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class RecordingSignals:
         values: (K + T, C) values in the units of the C channels, NaN if invalid; the first K rows precede the
             recording in its stream.
         activity: (T,) deviation of all channels from rest, where 1 is typical; NaN while the scale is unknown.
+        usual: (C,) typical spread of the channels in recordings of the data set; 0 where it is unknown.
     """
 
     info: RecordingInfo
@@ -71,6 +76,7 @@ class RecordingSignals:
     at: NDArray[np.float64]
     values: NDArray[np.float64]
     activity: NDArray[np.float64]
+    usual: NDArray[np.float64]
 
     @cached_property
     def _centred(self) -> NDArray[np.float64]:
@@ -81,11 +87,16 @@ class RecordingSignals:
         """Return the row nearest to a time; T means the end of the recording."""
         return int(np.abs(self.seconds - second).argmin())
 
-    def curves(self, group: str, low: float | None = None, high: float | None = None) -> PlottedCurves:
+    def curves(
+        self, group: str, low: float | None = None, high: float | None = None, enlarged: bool = False
+    ) -> PlottedCurves:
         """Return the curves of a group from ``low`` to ``high`` seconds, thinned to about 3000 points.
 
-        If there are several kinds of channels, each kind has its own lane and is scaled by its largest deviation.
+        If there are several kinds of channels, each kind has its own lane and is scaled by its largest deviation. What
+        is below the usual spread of the channels looks small, unless it is ``enlarged``.
         """
+        usual = 0.0 * self.usual if enlarged else self.usual
+        limits: tuple[float, float] | None = None
         at, table, unit = self.at, self.values, ""
         lanes: list[tuple[float, str]] = []
         channels = [i for i, c in enumerate(self.layout.channels) if group in (ALL, c.kind)]
@@ -97,11 +108,16 @@ class RecordingSignals:
             table = self._centred[:, channels].copy()
             for lane, kind in enumerate(kinds):
                 mine = [k for k, i in enumerate(channels) if self.layout.channels[i].kind == kind]
-                swing = float(np.nanmax(np.abs(table[:, mine]), initial=0.0)) or 1.0
+                swing = float(np.nanmax(np.abs(table[:, mine]), initial=usual[channels][mine].max())) or 1.0
                 table[:, mine] = table[:, mine] / swing - _LANE * lane
                 lanes.append((-_LANE * lane, kind))
+            limits = (1.08 - _LANE * len(lanes), 1.08)
         else:
             table, unit = table[:, channels], self.layout.channels[channels[0]].unit
+        if not lanes:
+            limits = _widened(
+                table, 1.0 if group == ACTIVITY and not enlarged else float(usual[channels].max(initial=0.0))
+            )
         if low is not None and high is not None:
             first, last = np.searchsorted(at, (low, high))
             part = slice(max(0, int(first) - 1), int(last) + 1)
@@ -112,7 +128,16 @@ class RecordingSignals:
         if thinned:
             at, table = _thinned(at, table)
         curves = [_plain(column) for column in table.T]
-        return PlottedCurves(np.round(at, 4).tolist(), curves, names, unit, lanes, thinned)
+        return PlottedCurves(np.round(at, 4).tolist(), curves, names, unit, lanes, thinned, limits)
+
+
+def _widened(table: NDArray[np.float64], least: float) -> tuple[float, float] | None:
+    """Return limits ``least`` apart around the values; None if these are further apart themselves, or all invalid."""
+    low, high = np.nanmin(table, initial=np.inf), np.nanmax(table, initial=-np.inf)
+    if not 0.0 <= high - low < least:
+        return None
+    middle = float(low + high) / 2.0
+    return middle - 0.6 * least, middle + 0.6 * least
 
 
 def read_signals(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float64]) -> RecordingSignals:
@@ -133,6 +158,7 @@ def read_signals(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float6
         np.concatenate([before_at, seconds[:-1]]),
         np.where(bad, np.nan, raw * steps),
         np.round(active, 4),
+        scale * steps if len(scale) else np.zeros(len(steps)),
     )
 
 

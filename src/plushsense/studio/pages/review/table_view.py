@@ -53,8 +53,9 @@ class ReviewTable(Element, component="review_table.js"):
     ) -> None:
         super().__init__()
         columns = [{"key": k, "label": words(_HEADS[k]), "sorts": k in SORTS} for k in (*SORTS, "path")]
+        signs = ", ".join(f"{sign} {words.affect(affect)}" for affect, sign in AFFECT_SIGNS.items())
         self._props.update(
-            caption=words("Recordings"),
+            caption=f"{words('Recordings')} ({signs})",
             columns=columns,
             rows=[],
             spark=words("Deviation of the signals from rest over the recording; the part that is kept is shaded"),

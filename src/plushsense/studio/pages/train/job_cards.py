@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from nicegui import ui
 
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
-from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, section, tag
+from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, reveal, section, tag
 from plushsense.studio.app.stored_results import (
     ResultRow,
     StoredResults,
@@ -145,7 +145,7 @@ class JobsSection:
         self._built: Any = None
         self._done: set[str] = set()
         with section(self.words("Jobs"), classes=""):
-            self._place = ui.column().classes("w-full")
+            self._place = page.work = ui.column().classes("w-full")
         self.refresh()
 
     def _all(self) -> list[StudioJob]:
@@ -193,10 +193,11 @@ class JobsSection:
             button("", w("Show"), lambda: self.open(job.id), "flat dense", about=job.title)
 
     def open(self, identity: str) -> None:
-        """Move a job from the list to a card."""
+        """Move a job from the list to a card, and reveal it."""
         self._open.add(identity)
         self._closed.discard(identity)
         self.refresh()
+        reveal(self._cards[identity].box)
 
     def close(self, identity: str) -> None:
         """Move a job from its card to the list."""
@@ -221,8 +222,8 @@ class _Card:
         self._bar: ui.linear_progress | None = None
         self._text: ui.label | None = None
         self._warned = -1
-        with tag(ui.element("article").classes("ps-card w-full column no-wrap ps-small-gap"), "job") as box:
-            named(box.props(f'data-job="{job.id}" data-state="{job.state}"'), job.title)
+        with tag(ui.element("article").classes("ps-card w-full column no-wrap ps-small-gap"), "job") as self.box:
+            named(self.box.props(f'data-job="{job.id}" data-state="{job.state}"'), job.title)
             with ui.row().classes("w-full items-center"):
                 tag(_badge(w, job.state), "state")
                 ui.label(f"{w(KINDS_OF_TRAINING[job.task])}: {job.title}").classes("text-bold")
@@ -233,6 +234,7 @@ class _Card:
                 named(self._bar.props("instant-feedback"), w("Progress of {title}", title=job.title))
                 tag(self._bar, "progress")
                 self._text = tag(ui.label(), "at")
+                ui.label(w("You may close this page: the work goes on.")).classes("ps-dim")
             elif job.state == STOPPED:
                 ui.label(w("Stopped. What is finished is saved; press “Continue” to go on."))
                 self._saved_network()

@@ -22,6 +22,7 @@ from plushsense.studio.app.shell import (
     heading,
     html,
     icon_button,
+    reveal,
     scroll_region,
     tag,
 )
@@ -46,7 +47,7 @@ from plushsense.studio.app.stored_results import (
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import plain_name
 from plushsense.studio.pages.train.job_requests import export_request
-from plushsense.studio.widgets.elements import scroll_to, table_html
+from plushsense.studio.widgets.elements import table_html
 from plushsense.studio.widgets.verdict import comparison, figures, limits, network_links, show_verdict
 
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
@@ -68,7 +69,7 @@ class ResultDetailsView:
         self._details = await run.io_bound(self._results.details, row)
         self._others = await run.io_bound(self._results.comparable, row) or []
         self._draw()
-        ui.run_javascript("setTimeout(() => document.querySelector('[data-test=details]')?.scrollIntoView(), 60)")
+        reveal(self._place)
 
     def _close(self) -> None:
         self._details = None
@@ -213,7 +214,7 @@ class ResultDetailsView:
             jobs = workspace.part(Jobs)
             request = export_request(workspace, jobs, d.row)
             jobs.start(request.task, request.spec, request.title)
-            scroll_to("job")
+            self._page.show_work()
 
     async def _compare(self, d: ResultDetails, identity: str) -> None:
         from plushsense.experiments.analysis.comparison import compare

@@ -86,13 +86,13 @@ class ResultsSection:
             )
             ui.label(about).classes("ps-dim")
             with ui.row().classes("items-center"):
-                self._by_data = ui.select({"": w("all data sets")}, value="", label=w("Data set"))
+                self._by_data = ui.select({"": w("all data sets")}, value="", label=w("Results of the data set"))
                 tag(self._by_data.classes("w-64"), "filter-data").on_value_change(self._filtered)
                 kinds = {"": w("everything")}
                 kinds |= {kind: w(_KINDS[kind]) for kind in (EVALUATION, TRIAL, TRAINING)}
                 self._by_kind = ui.select(kinds, value="", label=w("Kind"))
                 tag(self._by_kind.classes("w-64"), "filter-kind").on_value_change(self._filtered)
-            table = tag(scroll_region(w("Results")), "results")
+            table = tag(scroll_region(w("Results, one per row; click a heading to sort")), "results")
             with table.on("click", self._clicked, js_handler=_CLICKS):
                 self._html = html()
             self._pareto = ui.column().classes("w-full")
@@ -132,7 +132,6 @@ class ResultsSection:
             _refocus(f"sort:{which}")
         elif action == "open":
             await self.open(which)
-            _refocus(str(event.args))
         elif action == "all":
             self._all = True
             self._draw()

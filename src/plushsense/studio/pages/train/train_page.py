@@ -40,7 +40,7 @@ from plushsense.studio.pages.train.job_requests import (
     job_request,
 )
 from plushsense.studio.pages.train.results_section import ResultsSection
-from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, notice, scroll_to
+from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, ask, notice
 from plushsense.studio.widgets.verdict import FEW_PEOPLE
 from plushsense.training.spec import DEVICES, PRESETS
 from plushsense.windows.cut import ANYWHERE, CONTEXTS, TRAIN_CONTEXTS
@@ -153,11 +153,13 @@ _NUMBERS = (
 class TrainingForm:
     """Form for a new job: one button for the usual one, and all others with their settings folded away.
 
-    It keeps entered values when another kind of job is chosen.
+    It keeps entered values when another kind of job is chosen. ``begun`` is called with the id of a job that it has
+    started.
     """
 
-    def __init__(self, page: Page, jobs: Jobs, results: StoredResults) -> None:
+    def __init__(self, page: Page, jobs: Jobs, results: StoredResults, begun: Callable[[str], None]) -> None:
         self._page, self._jobs, self._results, self._words = page, jobs, results, page.words
+        self._begun = begun
         self._datasets = {str(path): page.workspace.title(path) for path in page.workspace.datasets()}
         self._kind = TRAIN
         self._values: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
@@ -432,10 +434,18 @@ class TrainingForm:
             self._begin(job_request(self._page.workspace, self._jobs, form))
 
     def _begin(self, request: JobRequest) -> None:
-        self._jobs.start(request.task, request.spec, request.title)
-        begun = self._words("The work has begun: its progress is under “Jobs” below. You may close this page.")
-        self._page.say(begun, "good")
-        scroll_to("job")
+        """Start a job, but ask first while another one trains: two at once take longer each."""
+        jobs, w = self._jobs, self._words
+
+        def start(_: str = "") -> None:
+            self._begun(jobs.start(request.task, request.spec, request.title).id)
+
+        running = [job for job in jobs.all(MAKE, *KINDS) if job.state == RUNNING and not job.spec.get("dry")]
+        if not running:
+            start()
+            return
+        text = "“{title}” is still being worked on, and two jobs at once take about twice as long each."
+        ask(w, w(text, title=running[0].title), w("Start both"), start)
 
     def _estimate(self) -> None:
         self._page.say("")
@@ -573,7 +583,7 @@ async def show(page: Page) -> None:
     )
     ui.label(about).classes("ps-dim")
     rows = await run.io_bound(results.rows)
-    form = TrainingForm(page, jobs, results)
+    form = TrainingForm(page, jobs, results, lambda identity: job_list.open(identity))
     job_list = JobsSection(page, jobs, results, lambda identity: table.open(identity))
     table = ResultsSection(page, results, rows or [])
     context.client.on_delete(form.close)
