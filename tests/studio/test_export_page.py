@@ -104,7 +104,7 @@ def test_export_verify_and_break(
     assert "Verify “one”" in marked(page, "work").inner_text()
     other = look(TABLET, dark=True, language="lv", touch=True)
     tablet = other.open(f"{url}/export?name=one")
-    assert "Pārbaude: “one”" in marked(tablet, "work").inner_text()
+    assert "Pārbaude: „one”" in marked(tablet, "work").inner_text()
     assert sideways(tablet) == 0 and axe(tablet) == []
     marked(tablet, "stop").click()
     marked(page, "ended").wait_for(timeout=LONG_MS)

@@ -96,7 +96,7 @@ def test_a_zip_of_a_new_sensor_comes_in_and_is_used_to_the_end(studio: Fixture, 
     page.get_by_role("option", name="Recording of S01: hug (gloves)").click()
     marked(page, "start").click()
     page.get_by_text("The data of the toy have ended.").wait_for(timeout=LONG_MS)
-    page.goto(f"{url}/export")
+    page.goto(f"{url}/export?model={home / 'bundles' / 'glove.plush'}")
     marked(page, "bundle-facts").get_by_text("glove", exact=True).wait_for(state="attached")
     assert marked(page, "bundle-cannot").count() == 0 and marked(page, "do").is_enabled()
     assert browser.complaints == []
@@ -110,7 +110,7 @@ def test_a_label_in_a_column_a_single_file_and_damaged_ones(studio: Fixture, loo
     bring(page, folder, button="choose_folder")
     rows = marked(page, "mapping-rows")
     rows.get_by_text("diary/nora.txt").first.wait_for(timeout=LONG_MS)
-    assert "“nora” katrā failā ir cits: mēģinājums vai cilvēks?" in marked(page, "doubt").all_inner_texts()
+    assert "„nora” katrā failā ir cits: mēģinājums vai cilvēks?" in marked(page, "doubt").all_inner_texts()
     pick(page, "subject", "faila nosaukums: nora")
     rows.get_by_role("cell", name="nora", exact=True).first.wait_for(timeout=LONG_MS)
     pick(page, "idle", "ruhe")

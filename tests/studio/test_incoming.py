@@ -171,7 +171,7 @@ def test_files_are_dropped_and_what_is_missing_is_asked_in_latvian(
     saved = tmp_path / "virtual.zip"
     backup(furniture / "datasets" / "virtual", saved)
     drop(page, saved)
-    marked(page, "preview").get_by_text("datu kopas “virtual toy” rezerves kopija").wait_for(timeout=LONG_MS)
+    marked(page, "preview").get_by_text("datu kopas „virtual toy” rezerves kopija").wait_for(timeout=LONG_MS)
     marked(page, "import").click()
     marked(page, "dataset").get_by_text("virtual toy", exact=True).wait_for()
     assert sorted(p.name for p in (tmp_path / "home" / DATASETS).iterdir())[1:] == ["virtual toy"]

@@ -359,7 +359,7 @@ def own_list(page: Page) -> None:
     marked(page, "own-Tail pull").click()
     marked(page, "own-name").fill("Mans saraksts")
     marked(page, "own-save").click()
-    page.get_by_role("alert").filter(has_text="“Mans saraksts” jau ir").wait_for()
+    page.get_by_role("alert").filter(has_text="„Mans saraksts” jau ir").wait_for()
     marked(page, "own-protocol").locator("summary").click()
     marked(page, "discard-protocol").click()
     marked(page, "message").get_by_text("“Mans saraksts” ir izmests").wait_for()

@@ -469,11 +469,11 @@ def test_what_is_wrong_is_named_beside_its_field(studio: Fixture, look: Fixture,
     marked(page, "start").click()
     refused = state(page, "refused").locator('[data-test="refused"]')
     assert refused.inner_text() == (
-        "Rezultātu nevar ierakstīt: “evaluations” ir fails, nevis mape. Pārvietojiet vai pārdēvējiet to."
+        "Rezultātu nevar ierakstīt: „evaluations” ir fails, nevis mape. Pārvietojiet vai pārdēvējiet to."
     )
     shutil.move(folder, home / "elsewhere")
     marked(page, "make").click()
-    beside("dataset").get_by_text("Datu kopas “virtual” vairs nav").wait_for()
+    beside("dataset").get_by_text("Datu kopas „virtual” vairs nav").wait_for()
     assert (home / "bundles" / "little.plush").read_bytes() == little
     assert [path.name for path in (home / "bundles").iterdir()] == ["little.plush"]
     assert browser.complaints == []
@@ -503,7 +503,7 @@ def test_one_button_makes_a_network_that_a_stop_does_not_lose(studio: Fixture, l
     stopped = state(page, "stopped")
     network = few / "bundles" / "virtual toy.plush"
     saved = network.read_bytes()
-    assert "“virtual toy” ir saglabāts" in stopped.locator('[data-test="saved"]').inner_text()
+    assert "„virtual toy” ir saglabāts" in stopped.locator('[data-test="saved"]').inner_text()
     assert stopped.locator('[data-test="to-live"]').is_visible()
     assert axe(page) == []
     marked(page, "resume").click()
