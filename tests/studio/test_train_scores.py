@@ -160,7 +160,8 @@ def test_a_verdict_names_its_limits(home: Path) -> None:
     leaky = replace(row, split="windows:5", leaky=True)
     assert "this test is too easy" in headline(w, leaky) and limits(w, leaky) == []
     assert headline(w, replace(row, accuracy=None)) == "This result has no score."
-    proof = replace(row, kind=EVALUATION, split="by-subject:5", spread="subjects", units=25, interval=(0.38, 0.46))
+    tested = replace(row, kind=EVALUATION, split="by-subject:5", spread="subjects", units=25, interval=(0.38, 0.46))
+    proof = replace(tested, proof=home / "evaluation")
     gain = {"more": 2, "gain": 0.031, "ci95": [0.012, 0.05]}
     assert limits(w, replace(proof, learning=gain)) == [
         "Measured on 25 people. For other people like them, the average is probably between 3.8 and 4.6 of 10 "
