@@ -16,9 +16,9 @@ from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import CsvFormat, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
-from plushsense.dataset.files import IndexStamp
+from plushsense.dataset.files import IndexStamp, change_head
 from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.index import change_head, open_dataset
+from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.publishing.package import missing_statements
 from plushsense.dataset.store import Dataset, DatasetHead, RecordingInfo, read_index

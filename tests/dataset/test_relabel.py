@@ -12,7 +12,8 @@ import pytest
 from plushsense.cli.main import main
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.dataset.index import change_head, open_dataset, rebuild_index
+from plushsense.dataset.files import change_head
+from plushsense.dataset.index import open_dataset, rebuild_index
 from plushsense.dataset.labelling import relabel_recordings
 from plushsense.dataset.publishing.package import complete_head, publish
 from plushsense.dataset.quality.checking import check

@@ -13,13 +13,13 @@ import pytest
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.models.arch import Arch
+from plushsense.studio.app import stored_results
+from plushsense.studio.app.stored_results import EVALUATION, TRIAL, ResultRow, StoredResults, split_text
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.train import stored_results
 from plushsense.studio.pages.train.result_details import confusion_table, worst_table
 from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_table
-from plushsense.studio.pages.train.stored_results import EVALUATION, TRIAL, ResultRow, StoredResults, split_text
-from plushsense.studio.pages.train.verdict import figures, headline, limits, people_table
+from plushsense.studio.widgets.verdict import figures, headline, limits, people_table
 from plushsense.workflow.reporting import LEARNING, SCORES
 from support.study import evaluation
 

@@ -336,6 +336,9 @@ def test_the_network_is_adapted_to_recordings_of_the_person(studio: Fixture, loo
     message.get_by_text("The network little is in use again.").wait_for()
     assert ps.load(home / "bundles" / "little-for-S08.plush").adapted_to == "S08"
     assert little.read_bytes() == before
+    # The network of S08 is the newest, but Home goes on with the one for everybody.
+    other = browser.open(page.url.partition("/live")[0])
+    marked(other, "next-sentence").get_by_text("The network “little” is trained").wait_for()
     marked(page, "start").click()
     situation(page, *READING)
     assert browser.complaints == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from plushsense.studio.pages.home.overview import (
 from plushsense.studio.tasks import TASKS, TaskReporter
 from plushsense.workflow.api import simulate
 from support.recorded import record
+from support.results import row
 
 
 class Quiet:
@@ -128,8 +130,12 @@ ALONE = DatasetEntry(Path("a"), "alone", people=1, recordings=4, reviewed=True)
 MANY = DatasetEntry(Path("v"), "many", people=6, recordings=50, reviewed=True)
 TRIED = DatasetEntry(Path("v"), "virtual", simulated=True, recordings=9)
 BROKEN = DatasetEntry(Path("b"), "broken", "It is broken.")
-NET = BundleEntry(Path("m.plush"), "m")
-TOY_NET = BundleEntry(Path("v.plush"), "v", simulated=True)
+PROVEN = replace(row("m", 100, 0.5), interval=(0.4, 0.6), chance=0.1)
+GUESSING = replace(PROVEN, interval=(0.1, 0.9))
+LEAKY = replace(PROVEN, leaky=True)
+NET = BundleEntry(Path("m.plush"), "m", score=PROVEN)
+GUESS = BundleEntry(Path("g.plush"), "g", score=GUESSING)
+TOY_NET = BundleEntry(Path("v.plush"), "v", simulated=True, score=PROVEN)
 BROKEN_NET = BundleEntry(Path("b.plush"), "b", refused="It is broken.")
 OPEN = SessionEntry(Path("s"), "S01", "1")
 MADE = SessionEntry(Path("s"), "S01", "1", recordings=4)
@@ -156,6 +162,9 @@ KEPT = SessionEntry(Path("s"), "S01", "1", recordings=4, finished=True, datasets
         (WorkspaceSummary(datasets=(TRIED, REAL), bundles=(TOY_NET,)), "", "review", "review"),
         (WorkspaceSummary(datasets=(REAL,), bundles=(NET,)), "", "live", "live"),
         (WorkspaceSummary(bundles=(NET,)), "", "live", "live"),
+        (WorkspaceSummary(datasets=(LOOKED,), bundles=(GUESS,)), "", "improve", "record"),
+        (WorkspaceSummary(datasets=(LOOKED,), bundles=(replace(NET, score=LEAKY),)), "", "improve", "record"),
+        (WorkspaceSummary(bundles=(replace(NET, score=None),)), "", "improve", "record"),
         (WorkspaceSummary(bundles=(BROKEN_NET,)), "", "try", ""),
         (WorkspaceSummary(datasets=(LOOKED,), bundles=(BROKEN_NET,)), "", "train", "train"),
     ],
@@ -163,6 +172,11 @@ KEPT = SessionEntry(Path("s"), "S01", "1", recordings=4, finished=True, datasets
 def test_what_to_do_next(seen: WorkspaceSummary, toy: str, key: str, page: str) -> None:
     step = next_step(seen, toy=toy, virtual=toy.startswith("virtual"))
     assert (step.key, step.page) == (key, page)
+
+
+def test_a_network_that_guesses_is_passed_over() -> None:
+    step = next_step(WorkspaceSummary(datasets=(LOOKED,), bundles=(GUESS, NET)))
+    assert (step.key, step.values) == ("live", {"name": "m", "model": Path("m.plush")})
 
 
 def test_while_a_data_set_is_made_nothing_else_is_next() -> None:

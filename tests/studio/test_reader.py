@@ -228,7 +228,7 @@ def test_a_feed_sends_everything_once_and_anew_when_it_missed_some(workspace: Wo
     assert what == "scene", "another toy is another scene"
     assert len(scene["channels"]) == 13
     assert len(scene["classes"]) == 18
-    assert scene["simulated"] is True
+    assert reader.simulated == "toy"
     seconds = list(scene["first"]["x"])
     assert WINDOW_S - 0.2 < seconds[-1] - seconds[0] <= WINDOW_S + 0.2
     while seconds[-1] < scene["first"]["x"][-1] + 3.0:

@@ -120,25 +120,25 @@ def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path
 def test_every_page_names_the_session_that_is_being_recorded(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     server, browser = studio(*SPEED), look(TABLET)
     home = browser.open(server.url)
-    assert not marked(home, "recording-now").is_visible()
+    assert not marked(home, "in-use").is_visible()
     page = begun(browser.open(server.url + "/record"), server.url, "S01")
     take(page, 0)
-    marked(home, "recording-now").get_by_text("Recording now: S01/1.").wait_for()
+    marked(home, "in-use").get_by_text("Recording now: S01/1.").wait_for()
     assert "is being recorded" in marked(home, "next-sentence").inner_text()
     home.reload()
     assert "being recorded now" in marked(home, "sessions").inner_text()
     assert home.locator("[data-test=batch] .q-checkbox").get_attribute("aria-disabled") == "true"
     assert axe(home) == []
-    marked(home, "recording-now").get_by_role("link").click()
+    marked(home, "in-use").get_by_role("link").click()
     home.wait_for_url("**/record?session=S01/1")
-    assert marked(home, "recording-now").count() == 0
+    assert not marked(home, "in-use").is_visible()
     home.goto(server.url + "/review")
-    marked(home, "recording-now").get_by_text("Recording now: S01/1.").wait_for()
+    marked(home, "in-use").get_by_text("Recording now: S01/1.").wait_for()
     # The session is ended early: its recordings are one button away.
     marked(page, "end").click()
     marked(page, "end-yes").click()
     page.wait_for_url("**/record?ended=S01/1")
-    marked(home, "recording-now").wait_for(state="hidden")
+    marked(home, "in-use").wait_for(state="hidden")
     assert "Recordings of this session: 1." in marked(page, "ended-session").inner_text()
     assert axe(page) == []
     marked(page, "collect").click()

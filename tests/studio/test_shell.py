@@ -6,6 +6,7 @@ import ast
 import json
 import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,11 +21,11 @@ from plushsense.deploy.code import FACTS
 from plushsense.recording.writer import SESSION_HEAD, SESSION_LOG
 from plushsense.studio.app import shell
 from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES, TOUR, page_texts
+from plushsense.studio.app.stored_results import Confusion
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review.controller import VIEWS
 from plushsense.studio.pages.train.result_details import confusion_table
-from plushsense.studio.pages.train.stored_results import Confusion
 from plushsense.studio.widgets.elements import link, picture, verdict
 from plushsense.workflow.api import simulate
 from plushsense.workflow.reporting import SCORES
@@ -45,6 +46,20 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     yield one.url
     one.stop()
     assert not [line for line in one.errors if "Traceback" in line], "".join(one.errors)
+
+
+def test_the_first_page_imports_little() -> None:
+    """Each of these modules would make everybody wait who starts the studio."""
+    code = (
+        "import sys, plushsense.cli.studio, plushsense.studio.app.serve, plushsense.studio.pages.home.home_page as _\n"
+        "print(*(m for m in sys.modules if m.startswith('plushsense.') or '.' not in m))"
+    )
+    found = set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split())
+    assert found.isdisjoint({"babel", "matplotlib", "pandas", "polars", "sklearn", "torch"})
+    packages = ("dataset.publishing", "dataset.quality", "deploy", "models", "runtime", "training", "workflow")
+    assert [m for m in sorted(found) if m.removeprefix("plushsense.").startswith(packages)] == []
+    # Of 112 before.
+    assert sum(m.startswith("plushsense.") for m in found) < 75
 
 
 @pytest.mark.parametrize(

@@ -161,8 +161,8 @@ def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, tmp_path: P
         t.fill(W("Minutes, at most"), "1")
         t.press(W("Make a network"))
         if PATIENT:
-            marked(t.page, "verdict").first.wait_for(timeout=300_000)
-            assert marked(t.page, "verdict").first.inner_text()
+            marked(t.page, "score").first.wait_for(timeout=300_000)
+            assert marked(t.page, "score").first.inner_text()
         else:
             # She saves time: the network is kept before it is tested on people left out.
             marked(t.page, "at").get_by_text(W("testing on people left out")).wait_for(timeout=240_000)

@@ -18,22 +18,22 @@ from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
 from plushsense.evaluation.scores import Predictions
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.words import Words
-from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.train.job_cards import progress_charts
-from plushsense.studio.pages.train.job_requests import JobRequest, free_name, grids, job_request
-from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_rows, pareto_table
-from plushsense.studio.pages.train.stored_results import (
+from plushsense.studio.app.stored_results import (
     TRAINING,
     Confusion,
-    ResultRow,
     StoredResults,
     over_trainings,
     recordings_of_cell,
     sum_by_affect,
 )
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.train.job_cards import progress_charts
+from plushsense.studio.pages.train.job_requests import JobRequest, free_name, grids, job_request
+from plushsense.studio.pages.train.results_section import comparable_groups, pareto_options, pareto_rows, pareto_table
 from plushsense.studio.tasks import Clock
 from plushsense.workflow.config import from_settings
+from support.results import row
 
 
 def made(workspace: Workspace, **form: Any) -> JobRequest:
@@ -208,16 +208,6 @@ def test_curves_of_folds_and_of_a_search() -> None:
 
 
 # Results ------------------------------------------------------------------------------------------------------
-
-
-def row(name: str, parameters: int, f1: float | None) -> ResultRow:
-    spread = {"spread": "folds", "units": 2, "accuracy": f1, "accuracy_sd": None, "macro_f1": f1, "macro_f1_sd": 0.01}
-    words = dict.fromkeys(("dataset", "data", "schedule", "split", "context", "seeds", "trial"), "")
-    marks = {"leaky": False, "simulated": True}
-    return ResultRow(
-        id=name, kind="trial", path=Path(name), network=name, parameters=parameters, macs=1, when_s=0.0,
-        **words, **marks, **spread,  # type: ignore[arg-type]
-    )  # fmt: skip
 
 
 def test_the_front_holds_what_none_beats() -> None:

@@ -15,10 +15,7 @@ from plushsense.core.errors import DatasetError
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.evaluation.scores import read_predictions
 from plushsense.scoring.metrics import accuracy_over_people
-from plushsense.studio.app.words import Words
-from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.train.result_details import confusion_table, worst_table
-from plushsense.studio.pages.train.stored_results import (
+from plushsense.studio.app.stored_results import (
     EVALUATION,
     TRAINING,
     TRIAL,
@@ -27,8 +24,12 @@ from plushsense.studio.pages.train.stored_results import (
     StoredResults,
     counted,
     figure,
+    score_interval,
 )
-from plushsense.studio.pages.train.verdict import figures, headline, limits, of_ten, people_table
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.train.result_details import confusion_table, worst_table
+from plushsense.studio.widgets.verdict import figures, headline, limits, of_ten, people_table
 from support.sweeping import keys
 
 pytestmark = [pytest.mark.apart("train-scores"), pytest.mark.early]
@@ -139,10 +140,19 @@ def test_every_network_whose_predictions_a_sweep_kept_leads_to_its_recordings(
         assert sum(r.windows for r in results.misread(row, [labels[i]], [labels[j]])) == counts[i, j]
 
 
+def test_few_answers_leave_a_wide_interval() -> None:
+    # All right, of three people with three recordings each: the mean of the people alone would be certain.
+    assert score_interval(1.0, 9, (1.0, 1.0)) == (pytest.approx(0.701, abs=0.001), 1.0)
+    assert score_interval(0.0, 9) == (0.0, pytest.approx(0.299, abs=0.001))
+    # Of many people, the spread between them decides.
+    assert score_interval(0.5, 10_000, (0.4, 0.6)) == (0.4, 0.6)
+    assert score_interval(0.5, 0) is None and score_interval(None, 9) is None
+
+
 def test_a_verdict_names_its_limits(home: Path) -> None:
     row = replace(row_of(home, TRAINING), accuracy=0.42, classes=18)
     w = Words("en")
-    assert headline(w, row) == "It reads about 4 of 10 touches of people it never met; guessing gives 0.6 of 10."
+    assert headline(w, row) == "It reads about 4 of 10 touches of one person it never met; guessing gives 0.6 of 10."
     assert limits(w, row)[0] == "This figure is uncertain: it was measured on only 1 person."
     assert headline(w, replace(row, split="by-recording:5")).startswith(
         "It reads about 4 of 10 moments, with those at rest, of people it knows"

@@ -44,6 +44,8 @@ def run(args: argparse.Namespace) -> int:
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
             f"{classifier.step_s * 1000:.0f} ms; Ctrl-C ends"
         )
+        if bundle.simulated:
+            say("SIMULATION: this network was trained on virtual people, so what it says of a real toy is no result")
         for assumed in device.notes:
             say(f"warning: {args.device}: {assumed}")
         fresh: list[str] = []

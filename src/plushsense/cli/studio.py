@@ -17,7 +17,6 @@ _HOME = "PlushSense"
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.store import DatasetHead
     from plushsense.devices.opening import parse_url
-    from plushsense.models.bundle import Bundle
     from plushsense.studio.app.serve import run as serve
     from plushsense.studio.app.workspace import Workspace
 
@@ -30,6 +29,8 @@ def run(args: argparse.Namespace) -> int:
     for folder in args.dataset:
         DatasetHead.read(Path(folder))
     for model in args.model:
+        from plushsense.models.bundle import Bundle
+
         Bundle.load(model)
     folder = Path(args.home) if args.home else Path.home() / _HOME
     if folder.exists() and not folder.is_dir():

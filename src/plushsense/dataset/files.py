@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import PART, foreign_link, write_file
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.store import HEAD, PEOPLE, RECORDINGS, STREAMS
+from plushsense.dataset.store import HEAD, PEOPLE, RECORDINGS, STREAMS, DatasetHead, Generation
 
 RECORDINGS_INDEX = "recordings.csv"
 STREAMS_INDEX = "streams.csv"
@@ -47,6 +47,11 @@ def is_own_file(path: Path, folder: Path) -> bool:
 def walk_files(folder: Path) -> list[Path]:
     """Return every file below a folder, sorted by path; folders that cannot be listed are left out."""
     return sorted(Path(place) / name for place, _, names in os.walk(folder) for name in names)
+
+
+def list_package_files(root: Path) -> list[Path]:
+    """Return every file below ``root``, sorted by the text of its path, which is the same on all systems."""
+    return sorted(walk_files(root), key=lambda p: p.relative_to(root).as_posix())
 
 
 def sha256_of(path: Path) -> str:
@@ -214,3 +219,27 @@ def match_code(word: str, codes: Iterable[str]) -> str:
     """Return the first of ``codes`` that equals ``word`` after `normalize_code`; "" if there is none."""
     key = normalize_code(word)
     return next((code for code in codes if normalize_code(code) == key), "")
+
+
+def change_head(folder: Path, change: Callable[[DatasetHead], DatasetHead]) -> DatasetHead:
+    """Replace ``dataset.toml`` atomically by ``change`` of its present contents, and return the new head.
+
+    The index stays valid unless the layout or the gesture set changes.
+
+    Raises:
+        DatasetError: if the folder is no data set, or the file cannot be written. It is unchanged then.
+    """
+    try:
+        with Generation.of(folder).writing():
+            before, fresh = DatasetHead.read(folder), IndexStamp.read(folder) == IndexStamp.of(folder)
+            head = change(before)
+            if head != before:
+                write_file(folder / HEAD, head.to_toml())
+                if fresh and (head.layout, head.gestures) == (before.layout, before.gestures):
+                    IndexStamp.of(folder).write(folder)
+    except OSError as cause:
+        why = cause.strerror or str(cause)
+        raise DatasetError(
+            "'{path}' cannot be written: {why}.", path=folder / HEAD, why=why, folder=folder.name
+        ) from None
+    return head

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
-from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
 from plushsense.core.row_times import bridged_ms, stray_rows
@@ -25,7 +24,6 @@ from plushsense.dataset.quality.checking import import_flags
 from plushsense.dataset.quality.findings import PARTLY_THERE
 from plushsense.dataset.quality.measurements import Examination, usual_rows
 from plushsense.dataset.store import (
-    HEAD,
     RECORDINGS,
     STREAMS,
     Dataset,
@@ -200,30 +198,6 @@ def write_index_files(dataset: Dataset, stamp: IndexStamp | None = None) -> None
     write_index(dataset.path / STREAMS_INDEX, dataset.streams, StreamInfo)
     write_index(dataset.path / RECORDINGS_INDEX, dataset.recordings, RecordingInfo)
     stamp.with_index(dataset.path).write(dataset.path)
-
-
-def change_head(folder: Path, change: Callable[[DatasetHead], DatasetHead]) -> DatasetHead:
-    """Replace ``dataset.toml`` atomically by ``change`` of its present contents, and return the new head.
-
-    The index stays valid unless the layout or the gesture set changes.
-
-    Raises:
-        DatasetError: if the folder is no data set, or the file cannot be written. It is unchanged then.
-    """
-    try:
-        with Generation.of(folder).writing():
-            before, fresh = DatasetHead.read(folder), IndexStamp.read(folder) == IndexStamp.of(folder)
-            head = change(before)
-            if head != before:
-                write_file(folder / HEAD, head.to_toml())
-                if fresh and (head.layout, head.gestures) == (before.layout, before.gestures):
-                    IndexStamp.of(folder).write(folder)
-    except OSError as cause:
-        why = cause.strerror or str(cause)
-        raise DatasetError(
-            "'{path}' cannot be written: {why}.", path=folder / HEAD, why=why, folder=folder.name
-        ) from None
-    return head
 
 
 def build_index(folder: Path, head: DatasetHead, progress: Progress | None = None) -> IndexBuild:

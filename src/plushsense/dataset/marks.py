@@ -19,6 +19,8 @@ from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.toml import load_table, loads_json
 
 MARKS = "marks.jsonl"
+RECORDER = "recorder"
+"""Who set the marks that were made while recording."""
 BY_HAND, SUGGESTED = "hand", "suggested"
 LOCK = MARKS + ".lock"
 """Lock file of a data set, see `locked`."""

@@ -264,7 +264,7 @@ def facts_of(model: IntegerModel, bundle: Bundle, image: bytes) -> ModelFacts:
         model_version=model_version if _VERSION.fullmatch(model_version) else code_version,
         training=training if _HASH.fullmatch(training) else "",
         memory_bytes=memory_bytes(model),
-        simulated=bool(bundle.provenance.get("simulated", False)),
+        simulated=bundle.simulated,
         provenance=bundle.provenance,
         personal=bundle.personal,
         code_version=code_version,

@@ -167,6 +167,11 @@ class Bundle:
         """Code of the person to whom the bundle is adapted, "somebody" if unknown; None if it is not adapted."""
         return str(self.personal.get("subject", "somebody")) if self.personal else None
 
+    @property
+    def simulated(self) -> bool:
+        """Whether the network was trained on virtual people; then nothing that it answers is a result."""
+        return bool(self.provenance.get("simulated"))
+
     def network(self) -> Network:
         """Return the NumPy network with these weights."""
         return Network(self.arch, self.weights)

@@ -40,13 +40,13 @@ from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.app.workspace import folder_digest, refusal_of
 from plushsense.training.spec import EpochRow
 from plushsense.workflow.api import simulate, train, unfinished
-from plushsense.workflow.config import from_settings
+from plushsense.workflow.config import from_settings, from_stored
 from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
 from plushsense.workflow.export import export
 from plushsense.workflow.forgetting import forget_everywhere
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people, refits
-from plushsense.workflow.reporting import check_folder
+from plushsense.workflow.reporting import check_folder, load_evaluation
 
 
 class TaskReporter:
@@ -274,8 +274,12 @@ def _validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`."""
-    config = from_settings(**spec.get("settings", {}))
+    """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`.
+
+    With ``evaluation``, a folder, the settings are those of that evaluation; with ``place``, it is exported.
+    """
+    stored = spec.get("evaluation")
+    config = from_stored(load_evaluation(stored)["config"]) if stored else from_settings(**spec.get("settings", {}))
     if spec.get("dry"):
         from plushsense.workflow.estimate import preview_training
 
@@ -307,7 +311,8 @@ def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         warn=reporter.warn,
     )
     bundle = done.save(free_path(out, done.bundle.to_bytes()))
-    return {"bundle": str(bundle)}
+    exported = _export({"bundle": str(bundle), "place": spec["place"]}, reporter) if spec.get("place") else {}
+    return {"bundle": str(bundle), **exported}
 
 
 def _make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:

@@ -196,6 +196,23 @@ _SETTINGS: dict[str, tuple[str, ...]] = {
 }
 
 
+def from_stored(config: Mapping[str, Any]) -> RunConfig:
+    """Return the settings for a training from those that an evaluation stored (`plushsense.workflow.preparation.Run`).
+
+    Raises:
+        ConfigError: if a table is missing, or has an unknown key or an invalid value.
+    """
+    try:
+        tables = {name: dict(config[name]) for name in ("windows", "model", "training", "evaluation", "anywhere")}
+        tables["training"]["preset"] = config["preset"]
+    except (KeyError, TypeError, ValueError):
+        raise ConfigError("The settings of this evaluation are incomplete. Evaluate again.") from None
+    tables["windows"].pop("span_s", None)
+    if context := tables["evaluation"].pop("train_context", None):
+        tables["windows"]["context"] = context
+    return resolve(None, **tables)
+
+
 def from_settings(config: RunConfig | None = None, /, **settings: Any) -> RunConfig:
     """Return ``config``, or build one from settings: ``arch="14d1_39d2_41d4", preset="loso"``; None: not given.
 

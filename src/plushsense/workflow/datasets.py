@@ -14,7 +14,8 @@ from filelock import FileLock
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.sentences import Message, plural
-from plushsense.dataset.index import as_dataset, change_head
+from plushsense.dataset.files import change_head
+from plushsense.dataset.index import as_dataset
 from plushsense.dataset.publishing.checking import StageProgress
 from plushsense.dataset.publishing.contents import ContentsSpec, person_codes, public_codes, public_labels
 from plushsense.dataset.publishing.keys import open_key

@@ -335,9 +335,9 @@ def warn_of_untrimmed(dataset: Dataset, gestures: GestureSet, warn: Warn) -> Non
     if not dataset.layout.is_labelled and 2 * len(untrimmed) > len(located):
         warn(
             Message(
-                "{n} of {of} recordings are not trimmed, so the network learns the time before a gesture as the "
-                "gesture and reports it too early and too often: run 'plushsense trim {path} --accept-above 0.5' "
-                "first",
+                "Without those at rest, {n} of {of} recordings are not trimmed, so the network learns the time "
+                "before a gesture as the gesture and reports it too early and too often: run "
+                "'plushsense trim {path} --accept-above 0.5' first",
                 n=len(untrimmed),
                 of=len(located),
                 path=dataset.path.name,

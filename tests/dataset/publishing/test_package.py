@@ -11,13 +11,13 @@ import pytest
 from plushsense.core.errors import DatasetError, ForgottenError, MissingExtraError
 from plushsense.core.recorder_csv import read_recording, read_stream
 from plushsense.dataset.about import Funding
+from plushsense.dataset.files import list_package_files
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.publishing.checking import validate_package
 from plushsense.dataset.publishing.contents import ContentsSpec
 from plushsense.dataset.publishing.keys import PublicationKey
 from plushsense.dataset.publishing.package import PublishResult, complete_head, publish
-from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import Dataset
 from support.toys import KEY, SECRETS, made_of, make
 

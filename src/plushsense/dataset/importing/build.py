@@ -50,7 +50,7 @@ from plushsense.dataset.index import (
     rebuild_index,
     write_index_files,
 )
-from plushsense.dataset.marks import Mark, MarkState, adding_locked, append_marks, read_marks, write_marks
+from plushsense.dataset.marks import RECORDER, Mark, MarkState, adding_locked, append_marks, read_marks, write_marks
 from plushsense.dataset.privacy.forget import read_removals
 from plushsense.dataset.privacy.removed import remembers_removed
 from plushsense.dataset.store import (
@@ -69,7 +69,6 @@ from plushsense.dataset.store import (
 )
 from plushsense.recording.writer import SESSION_LOG
 
-RECORDER = "recorder"
 TWICE = Message("the same file was already imported")
 # Files to which the recorder only appends.
 APPENDED = (STREAM_NAME, SESSION_LOG)

@@ -24,7 +24,7 @@ from typing import Any
 
 from plushsense.core.errors import MissingExtraError, PlushSenseError, need
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name, read_stream
-from plushsense.dataset.files import sha256_of
+from plushsense.dataset.files import list_package_files, sha256_of
 from plushsense.dataset.index import IndexBuild, build_index
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.publishing.contents import LATEST_MS, WALL_CLOCK_MS, PackageContents
@@ -35,7 +35,7 @@ from plushsense.dataset.publishing.croissant import (
 )
 from plushsense.dataset.publishing.description import CHECKSUMS, DATA, Description, find_licence
 from plushsense.dataset.publishing.metadata import DATACITE_FILE, DATAPACKAGE_FILE
-from plushsense.dataset.publishing.tables import build_tables, list_package_files, open_package, read_checksums
+from plushsense.dataset.publishing.tables import build_tables, open_package, read_checksums
 from plushsense.dataset.store import PEOPLE, DatasetHead, read_people
 
 # Flags are not compared, since their wording may differ between versions.

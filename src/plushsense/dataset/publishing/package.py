@@ -20,6 +20,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
 from plushsense.core.sentences import Message
 from plushsense.dataset.about import Contact
+from plushsense.dataset.files import list_package_files
 from plushsense.dataset.index import open_dataset, write_index_files
 from plushsense.dataset.publishing.checking import EXTRA, StageProgress, ValidationResult, check_folder
 from plushsense.dataset.publishing.contents import (
@@ -52,7 +53,7 @@ from plushsense.dataset.publishing.metadata import (
     write_json,
     write_text,
 )
-from plushsense.dataset.publishing.tables import list_package_files, write_checksums, write_tables, write_zip
+from plushsense.dataset.publishing.tables import write_checksums, write_tables, write_zip
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead, PersonInfo
 
 # In smaller groups, age group and gender alone could identify a person.

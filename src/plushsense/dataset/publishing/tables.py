@@ -18,7 +18,7 @@ from plushsense.core.errors import DatasetError
 from plushsense.core.files import replacing_file, temporary_folder, work_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.toml import load_table
-from plushsense.dataset.files import sha256_of, walk_files
+from plushsense.dataset.files import list_package_files, sha256_of
 from plushsense.dataset.importing.archives import UnpackLimits, unpack, zip_entry
 from plushsense.dataset.publishing.contents import PackageContents
 from plushsense.dataset.publishing.description import (
@@ -161,11 +161,6 @@ def _channels(d: Dataset) -> Iterable[Row]:
 
 _LINE = re.compile(r"(?P<sha>[0-9a-f]{64}) [ *](?P<path>.+)")
 _LIMITS = UnpackLimits(total_bytes=64 * 2**30)
-
-
-def list_package_files(root: Path) -> list[Path]:
-    """Return every file below ``root``, sorted by path."""
-    return sorted(walk_files(root), key=lambda p: p.relative_to(root).as_posix())
 
 
 def write_checksums(root: Path) -> int:

@@ -235,7 +235,7 @@ def describe(bundle: Bundle, tensor: str) -> dict[str, str]:
         "rate_hz": layout.rate_hz,
         "units": list(InputUnits.of(layout).names),
         "input": _input_text(layout, tensor),
-        "simulated": bool(provenance.get("simulated", False)),
+        "simulated": bundle.simulated,
         "code_version": str(provenance.get("code_version", "")),
     }
     return {k: v if isinstance(v, str) else json.dumps(v, ensure_ascii=False) for k, v in facts.items()}

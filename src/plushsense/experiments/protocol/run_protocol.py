@@ -270,7 +270,7 @@ def _notes(scene: _Scene, scored: ScoredTrials, bundle: Bundle) -> list[str]:
             f"This bundle was trained on, or adapted to, people of the codes {', '.join(met)}: if they are the same "
             "people, their figures flatter."
         )
-    if bundle.provenance.get("simulated") is True and not scene.simulated:
+    if bundle.simulated and not scene.simulated:
         notes.append(NOTES["trained_virtual"])
     return notes + [f"{one.who} {one.why}, and was left out." for one in scene.left]
 

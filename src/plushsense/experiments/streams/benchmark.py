@@ -406,6 +406,8 @@ def _scored_people(
             f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset', '?')}': if "
             f"{', '.join(alike)} are the same people, their scores are too high"
         )
+    if bundle.simulated and not dataset.head.simulated:
+        warn("SIMULATION: the model was trained on virtual people, so its scores on real ones are no result")
     if not known:
         warn("the bundle does not say on whom it was trained: if on these people, the scores are too high")
     return people, met

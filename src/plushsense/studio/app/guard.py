@@ -22,9 +22,8 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from plushsense.core.errors import ConfigError
+from plushsense.dataset.files import list_package_files
 from plushsense.dataset.importing.archives import zip_entry
-from plushsense.dataset.publishing.tables import list_package_files
-from plushsense.deploy.code import FACTS
 from plushsense.studio.app.workspace import BACKUPS, EXPORTS, PACKAGES, Workspace
 
 COOKIE = "plushsense_visitor"
@@ -276,6 +275,8 @@ def router(workspace: Workspace) -> APIRouter:
             path = path_in(workspace, kind, name if kind == EXPORTS else f"{name}.zip")
         except ConfigError as refusal:
             return PlainTextResponse(f"{refusal}\n", 404)
+        from plushsense.deploy.code import FACTS
+
         if kind == EXPORTS and (path / FACTS).is_file():
             headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(path.name, safe='')}.zip"}
             return Response(zip_of(path), media_type="application/zip", headers=headers)

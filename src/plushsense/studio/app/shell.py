@@ -9,18 +9,21 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 from urllib.parse import urlencode
 
 from markupsafe import Markup, escape
-from nicegui import background_tasks, context, ui
+from nicegui import background_tasks, context, run, ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from nicegui.translations import translations
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.studio.app.choices import Choices
+from plushsense.studio.app.toys import ToyInUseError, Toys, ToyUse
 from plushsense.studio.app.words import LANGUAGES, PageTexts, Texts, Words
 from plushsense.studio.app.workspace import ChangeSignal, Workspace, refusal_of
 
@@ -150,10 +153,12 @@ class Page:
     dark: bool
     _messages: Any = None
 
-    def say(self, sentence: str, kind: Kind = "info", undo: Callable[[], Any] | None = None) -> None:
+    def say(
+        self, sentence: str, kind: Kind = "info", undo: Callable[[], Any] | None = None, label: str = "Undo"
+    ) -> None:
         """Show a message at the top of the page and announce it to screen readers; "" removes the message.
 
-        With ``undo``, the message has a button that calls it.
+        With ``undo``, the message has a button that calls it, with the English text ``label``.
         """
         self._messages.clear()
         if not sentence:
@@ -161,20 +166,37 @@ class Page:
         with self._messages, tag(message_row(kind), "message"):
             ui.label(sentence).classes("flex-grow")
             if undo is not None:
-                button("undo", self.words("Undo"), on_page(undo), "outline color=inherit")
+                button("undo", self.words(label), on_page(undo), "outline color=inherit")
             icon_button(
                 "close", self.words("Close this message"), lambda: self.say(""), "flat round dense color=inherit"
             )
 
     @contextmanager
-    def show_errors(self) -> Iterator[None]:
-        """Show errors raised in the block as a message on the page."""
+    def show_errors(self, again: Callable[[], Any] = lambda: None) -> Iterator[None]:
+        """Show errors raised in the block as a message on the page.
+
+        If another page uses the toy, the message has a button that stops that and calls ``again``.
+        """
         try:
             yield
+        except ToyInUseError as refusal:
+            use = refusal.use
+
+            async def free() -> None:
+                self.say("")
+                with self.show_errors():
+                    await run.io_bound(use.stop)
+                    if inspect.isawaitable(result := again()):
+                        await result
+
+            self.say(self.words.error(refusal), "warning", free, STOP_USE)
         except PlushSenseError as refusal:
             self.say(self.words.error(refusal), "error")
         except OSError as cause:
             self.say(self.words.error(refusal_of(cause)), "error")
+
+
+STOP_USE = "Stop that and use the toy here"
 
 
 def message_row(kind: Kind) -> ui.row:
@@ -219,8 +241,7 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
             _help(words, texts)
         _choices(words, dark)
     with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
-        if name != "record":
-            _recording_bar(page)
+        _in_use_bar(page)
         if TOUR in query() and texts.tour:
             _tour(words, name)
         tag(html(words(texts.title), "h1"), "title")
@@ -228,23 +249,38 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
         yield page
 
 
-def _recording_bar(page: Page) -> None:
-    """Add a bar that names the sessions that are being recorded, with a link to each; hide it while there are none."""
-    bar = tag(
-        ui.row().classes("ps-message ps-message-recording w-full items-center").props('role="status"'), "recording-now"
-    )
+_IN_USE: Texts = {"record": "Recording now: {name}.", "live": "Live now: {toy}."}
+_SHOW_USE: Texts = {"record": "Show the recording", "live": "Show it"}
+
+
+def _in_use_bar(page: Page) -> None:
+    """Add a bar that names what other pages record or read now, with a link to each; hide it while there is nothing."""
+    bar = tag(ui.column().classes("ps-message ps-message-recording w-full").props('role="status"'), "in-use")
+    toys, words = page.workspace.part(Toys), page.words
+
+    async def stop(use: ToyUse) -> None:
+        with page.show_errors():
+            await run.io_bound(use.stop)
 
     def draw() -> None:
+        uses = [use for use in toys.in_use if use.page != page.name]
         bar.clear()
-        bar.set_visibility(bool(page.workspace.recording))
+        bar.set_visibility(bool(uses))
         with bar:
-            for name in page.workspace.recording:
-                ui.label(f"● {page.words('Recording now: {name}.', name=name)}").classes("text-bold")
-                link = ui.link(page.words("Show the recording"), address("record", session=name)).classes("ps-link")
-                named(link, f"{page.words('Show the recording')}: {name}")
+            for use in uses:
+                text = words(_IN_USE[use.page], name=use.name, toy=use.toy)
+                with ui.row().classes("w-full items-center"):
+                    ui.label(f"● {text}").classes("text-bold ps-break")
+                    show = words(_SHOW_USE[use.page])
+                    link = ui.link(show, address(use.page, session=use.name)).classes("ps-link")
+                    named(link, f"{show}: {use.name or use.toy}")
+                    if not use.name:
+                        button(
+                            "stop-use", words("Stop"), on_page(partial(stop, use)), "outline color=white", about=use.toy
+                        )
 
     draw()
-    on_change(page.workspace.recording_changed, draw)
+    on_change(toys.in_use_changed, draw)
 
 
 def _help(words: Words, texts: PageTexts) -> None:
@@ -364,13 +400,13 @@ def query() -> dict[str, str]:
     return dict(request.query_params) if request is not None else {}
 
 
-def query_path(workspace: Workspace, key: str, allowed: Iterable[str]) -> str:
-    """Return the path in the query parameter ``key`` if it is allowed, else the first allowed path, or ""."""
+def query_path(workspace: Workspace, key: str, allowed: Iterable[str], default: str | None = None) -> str:
+    """Return the path in the query parameter ``key`` if allowed, else the last choice, ``default`` or the first."""
     paths = list(allowed)
     with suppress(PlushSenseError):
         if (path := str(workspace.inside(query().get(key, "")))) in paths:
             return path
-    return next(iter(paths), "")
+    return workspace.part(Choices).last(key, paths, default)
 
 
 def set_address(path: str) -> None:

@@ -29,7 +29,8 @@ from plushsense.devices.opening import (
     speed_of,
     with_speed,
 )
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.choices import Choices
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.windows.clock import SampleClock
 
@@ -112,12 +113,14 @@ class SampleBuffer:
 class TappedDevice(Device):
     """A device that also stores its frames in a `SampleBuffer`, from which pages display them.
 
-    The functions in ``taps`` are called with new frames in the reading thread; they must not block.
+    The functions in ``taps`` are called with new frames in the reading thread; they must not block. ``release`` is
+    called when the device is closed.
     """
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: Device, release: Callable[[], None] = lambda: None) -> None:
         super().__init__(device.url, device.layout)
         self.device = device
+        self._release = release
         self.counters = device.counters
         self.wait_s = device.wait_s
         self.buffer = SampleBuffer(device.layout, int(KEPT_S * device.layout.rate_hz))
@@ -181,6 +184,49 @@ class TappedDevice(Device):
 
     def _shut(self) -> None:
         self.device.close()
+        self._release()
+
+
+_USES: Texts = {
+    "home": "{toy} is being tested on the page Home. Try it again in some seconds.",
+    "record": "{toy} is in use: the session {name} on the page Record reads it.",
+    "live": "{toy} is in use: the page Live reads it.",
+}
+# Toys of these kinds have one reader at a time; each opening of a virtual one or a file is another toy.
+_SINGLE_READER = ("serial", "ble", "tcp")
+
+
+@dataclass(frozen=True, eq=False)
+class ToyUse:
+    """A toy that is open.
+
+    Attributes:
+        toy: its URL.
+        page: the page that reads it, a key of `plushsense.studio.app.shell.PAGES`.
+        stop: closes the toy, and returns when it is closed; raises ConfigError if it must not be closed now.
+        name: the session that is being recorded, or "".
+        busy: whether somebody is using it; otherwise it is closed as soon as another page needs it.
+    """
+
+    toy: str
+    page: str
+    stop: Callable[[], None]
+    name: str = ""
+    busy: Callable[[], bool] = lambda: True
+
+
+class ToyInUseError(DeviceError):
+    """A toy that cannot be opened, because another page of the studio reads it in the way that ``use`` tells."""
+
+    def __init__(self, use: ToyUse) -> None:
+        super().__init__(_USES[use.page], toy=use.toy, name=use.name)
+        self.use = use
+
+
+def _same_toy(one: str, other: str) -> bool:
+    """Return whether two URLs belong to a toy that only one reader can open."""
+    first, second = parse_url(one), parse_url(other)
+    return first.scheme in _SINGLE_READER and (first.scheme, first.place) == (second.scheme, second.place)
 
 
 PERSONS = 25
@@ -265,16 +311,25 @@ def with_layout(url: str, layout: str) -> str:
 
 
 class Toys:
-    """The toys found by a background search, and the choice of one; every change notifies `changed`."""
+    """The toys found by a background search, and the choice of one; every change notifies `changed`.
+
+    ``in_use`` are the open toys that somebody is using; a change of them notifies `in_use_changed`.
+    """
 
     def __init__(self, workspace: Workspace) -> None:
-        self.changed = ChangeSignal()
+        self.changed, self.in_use_changed = ChangeSignal(), ChangeSignal()
+        self.in_use: tuple[ToyUse, ...] = ()
+        self._uses: tuple[ToyUse, ...] = ()
         self.listing = DeviceListing()
         self.trial: ToyTrial | None = None
         self.searching = False
         self.searched = False
         self._workspace = workspace
+        self._choices = workspace.part(Choices)
         self._lock = threading.Lock()
+        if not workspace.toy and (last := self._choices.last("toy")):
+            with contextlib.suppress(PlushSenseError):
+                self.choose(last)
 
     def search(self, scan_s: float = SCAN_S, *, network: bool = True) -> None:
         """Start a search in the background, unless one is running; see `list_devices`."""
@@ -308,8 +363,48 @@ class Toys:
                 self._workspace.inside(layout)
         if url != self._workspace.toy:
             self._workspace.toy, self.trial = url, None
+        self._choices.keep(toy=url)
         self.changed.notify()
         return url
+
+    def open(self, use: ToyUse, opening: Callable[[], Device]) -> TappedDevice:
+        """Open a toy by ``opening``; the use lasts until the device is closed. Call `update_uses` when it has begun.
+
+        Raises:
+            ToyInUseError: if another page uses this toy. Otherwise as ``opening``.
+        """
+        self._take(use)
+        try:
+            return TappedDevice(opening(), lambda: self._release(use))
+        except BaseException:
+            self._release(use)
+            raise
+
+    def _take(self, use: ToyUse) -> None:
+        """Add a use; first close the same toy where nobody is using it."""
+        for _ in range(2):
+            with self._lock:
+                other = next((o for o in self._uses if _same_toy(o.toy, use.toy)), None)
+                if other is None:
+                    self._uses = (*self._uses, use)
+                    break
+            if other.busy():
+                break
+            other.stop()
+        if other is not None:
+            raise ToyInUseError(other)
+
+    def _release(self, use: ToyUse) -> None:
+        with self._lock:
+            self._uses = tuple(u for u in self._uses if u is not use)
+        self.update_uses()
+
+    def update_uses(self) -> None:
+        """Find out which toys somebody is using; call this when that has changed."""
+        in_use = tuple(use for use in self._uses if use.busy())
+        if in_use != self.in_use:
+            self.in_use = in_use
+            self.in_use_changed.notify()
 
     def try_out(self) -> None:
         """Test the chosen toy in the background; `trial` has the state and the result."""
@@ -348,17 +443,32 @@ class Toys:
 
         Raises:
             ConfigError: if no URL is given and no toy is chosen.
-            DeviceError: if the toy cannot be reached, or sends no frames.
+            DeviceError: if the toy cannot be reached, sends no frames, or is used by another page.
         """
         url = url or self._workspace.toy
         if not url:
             raise ConfigError("No toy is chosen. Choose one first.", field="toy")
-        url = with_speed(url, self._workspace.speed)
+        ends, ended = threading.Event(), threading.Event()
+
+        def stop() -> None:
+            ends.set()
+            ended.wait(_TIMEOUT_S)
+
+        try:
+            return self._measure(ToyUse(url, "home", stop, busy=lambda: False), ends)
+        finally:
+            ended.set()
+
+    def _measure(self, use: ToyUse, ends: threading.Event) -> ConnectionTest:
+        """Test a toy until ``ends`` is set; see `test`."""
+        url = with_speed(use.toy, self._workspace.speed)
         speed = speed_of(url) or 1.0
         frames, first, last = 0, None, None
         until = time.monotonic() + _TIMEOUT_S
-        with open_device(url) as device:
+        with self.open(use, lambda: open_device(url)) as device:
             while time.monotonic() < until and (frames or device.counters.malformed < _MALFORMED):
+                if ends.is_set():
+                    raise DeviceError("The test was stopped, because another page uses {url} now.", url=use.toy)
                 received = device.read()
                 if received is None:
                     break

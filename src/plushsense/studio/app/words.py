@@ -7,16 +7,14 @@ A translation names the forms that a word has after a number: ``{n:rinda|rindas}
 from __future__ import annotations
 
 import gettext
+import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
-
-from babel import Locale
-from babel.messages.catalog import Catalog
-from babel.messages.pofile import read_po
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Filler, Message, single_stops
@@ -32,6 +30,9 @@ Texts = Mapping[str, str]
 """Annotation of a table of English texts that `Words` translates; a test looks for texts in such tables, too."""
 
 _LOCALE = Path(__file__).parents[1] / "locale"
+_NUMBERS = {"en": (".", ","), "lv": (",", "\N{NO-BREAK SPACE}")}
+"""The decimal point and the thousands separator of each language."""
+_PO_LINE = re.compile(r'(?:(msgctxt|msgid|msgstr) )?(".*")')
 # The separator that gettext uses between context and text.
 _CONTEXT = "\x04"
 UNITS: Texts = {"count": "counts"}
@@ -77,11 +78,10 @@ class Words:
     def __init__(self, language: str) -> None:
         self.language = language if language in LANGUAGES else next(iter(LANGUAGES))
         self._catalog, self._plural_form = _catalog(self.language)
-        symbols = Locale(self.language).number_symbols["latn"]
-        self.decimal_point, self._group = symbols["decimal"], symbols["group"]
+        self.decimal_point, self._group = _NUMBERS[self.language]
 
     def __call__(self, text: str, /, **values: Any) -> str:
-        translated = str(self._translation(text) or text.rpartition(_CONTEXT)[2])
+        translated = self._catalog.get(text) or text.rpartition(_CONTEXT)[2]
         return _FormFiller(self).vformat(translated, (), values) if values else translated
 
     def each(self, *texts: str) -> list[str]:
@@ -91,11 +91,6 @@ class Words:
     def form(self, n: float, forms: Sequence[str]) -> str:
         """Return the form that goes with a number: that of 1 (in Latvian also of 21), or that of several."""
         return forms[self._plural_form(int(n))] if n == int(n) else forms[-1]
-
-    def _translation(self, text: str) -> str:
-        context, _, text = text.rpartition(_CONTEXT)
-        message = self._catalog.get(text, context or None)
-        return str(message.string) if message is not None else ""
 
     def number(self, value: float, digits: int = 0) -> str:
         """Format a number with the decimal separator of this language."""
@@ -111,7 +106,8 @@ class Words:
 
     def names(self, kind: str) -> dict[str, str]:
         """Return the translated names of a kind of thing, "gesture" or "channel", by their English names."""
-        return {str(m.id): str(m.string) for m in self._catalog if m.context == kind}
+        start = in_context(kind, "")
+        return {text.removeprefix(start): s for text, s in self._catalog.items() if text.startswith(start)}
 
     def gesture(self, label: str) -> str:
         """Return the name of a gesture in this language, or ``label`` itself if it has none."""
@@ -149,13 +145,13 @@ class Words:
         else:
             stored = message
         template = stored.get("template", "")
-        translation = self._translation(template) if template else ""
+        translation = self._catalog.get(template) if template else ""
         if not translation and self.language == next(iter(LANGUAGES)) and _has_message(stored.get("values", {})):
             translation = template
         if translation:
             # A stored job of another version may lack a value.
             with suppress(KeyError):
-                return single_stops(_ValueFiller(self).vformat(str(translation), (), stored["values"]))
+                return single_stops(_ValueFiller(self).vformat(translation, (), stored["values"]))
         text = str(stored.get("message", ""))
         return self(quoted, message=text) if text and self.language != next(iter(LANGUAGES)) else text
 
@@ -215,11 +211,16 @@ class _ValueFiller(_FormFiller):
 
 
 @cache
-def _catalog(language: str) -> tuple[Catalog, Callable[[int], int]]:
-    """Return the translations, and the function that maps a number to the index of its plural form."""
-    path = _LOCALE / f"{language}.po"
-    if not path.is_file():
-        return Catalog(), lambda n: int(n != 1)
-    with path.open("rb") as file:
-        catalog = read_po(file)
-    return catalog, gettext.c2py(catalog.plural_expr)
+def _catalog(language: str) -> tuple[dict[str, str], Callable[[int], int]]:
+    """Return the translations, by English text as `in_context` has it, and the function that chooses a plural form."""
+    translations: dict[str, str] = {}
+    for entry in (_LOCALE / f"{language}.po").read_text(encoding="utf-8").split("\n\n"):
+        fields: dict[str, str] = {}
+        field = ""
+        for name, quoted in (match.groups() for match in map(_PO_LINE.fullmatch, entry.splitlines()) if match):
+            field = name or field
+            fields[field] = fields.get(field, "") + json.loads(quoted)
+        if fields:
+            text = fields["msgid"] if "msgctxt" not in fields else in_context(fields["msgctxt"], fields["msgid"])
+            translations[text] = fields["msgstr"]
+    return translations, gettext.c2py(translations.pop("").partition("plural=")[2].partition(";")[0])

@@ -9,19 +9,17 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.sentences import Message
-from plushsense.dataset.files import person_folders, sha256_of
+from plushsense.dataset.files import change_head, list_package_files, person_folders, sha256_of
 from plushsense.dataset.importing.archives import DEVICE_NAME
-from plushsense.dataset.index import change_head
 from plushsense.dataset.privacy.codes import HomeCodes
 from plushsense.dataset.privacy.removed import RemovedCodes
-from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.writer import SESSION_HEAD
 
@@ -66,8 +64,6 @@ class Workspace:
         toy: URL of the chosen toy, "" for none.
         speed: speed of a virtual toy, as a multiple of real time.
         invite: returns an address with a new token for one more visitor; None if no token is needed.
-        recording: names of the sessions that are being recorded, as ``<subject>/<session>``; see `set_recording`.
-        recording_changed: notified when ``recording`` changes.
     """
 
     folder: Path
@@ -77,8 +73,6 @@ class Workspace:
     toy: str = ""
     speed: float = 1.0
     invite: Callable[[], str] | None = None
-    recording: tuple[str, ...] = ()
-    recording_changed: ChangeSignal = field(default_factory=lambda: ChangeSignal(), repr=False)
     _parts: dict[type, Any] = field(default_factory=dict, repr=False)
     _titles: dict[Path, tuple[FileStamps, str]] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
@@ -107,12 +101,6 @@ class Workspace:
         for part in reversed(parts):
             if hasattr(part, "close"):
                 part.close()
-
-    def set_recording(self, names: Iterable[str]) -> None:
-        """Set the names of the sessions that are being recorded; every page shows them."""
-        if self.recording != (now := tuple(names)):
-            self.recording = now
-            self.recording_changed.notify()
 
     # Contents -------------------------------------------------------------------------------------------------
 

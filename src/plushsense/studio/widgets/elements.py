@@ -311,6 +311,7 @@ class Plot(Element, component="plot.js"):
         x, y: titles of the axes, with units.
         height: height in pixels; the width is that of the surrounding element.
         window_s: length of the visible part of a live plot in seconds, see `push`.
+        share: whether the curves are shares, drawn on an axis from 0 to 1.
     """
 
     def __init__(
@@ -322,11 +323,12 @@ class Plot(Element, component="plot.js"):
         y: str = "",
         height: int = 240,
         window_s: float = 0.0,
+        share: bool = False,
     ) -> None:
         super().__init__()
         self.add_resource(_VENDOR)
         self._props.update(label=label, series=[dict(s) for s in series], xTitle=x, yTitle=y, height=height)
-        self._props.update(windowS=window_s, start=None)
+        self._props.update(windowS=window_s, start=None, share=share)
         self.classes("w-full")
 
     def begin(self, x: Sequence[float], curves: Sequence[Sequence[float | None]]) -> Plot:

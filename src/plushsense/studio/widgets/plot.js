@@ -7,7 +7,7 @@ export default {
   template: '<div role="img" :aria-label="label"><div ref="place"></div></div>',
   props: {
     label: String, series: Array, xTitle: String, yTitle: String, height: Number, windowS: Number,
-    start: Array, resourcePath: String,
+    start: Array, share: Boolean, resourcePath: String,
   },
   async mounted() {
     await this.$nextTick();
@@ -53,7 +53,7 @@ export default {
         height: this.height,
         legend: { live: false },
         cursor: { drag: { x: false, y: false } },
-        scales: { x: { time: false } },
+        scales: { x: { time: false }, ...(this.share ? { y: { range: [0, 1] } } : {}) },
         axes: [axis(this.xTitle, 44), axis(this.yTitle, 64)],
         series: [{ label: this.xTitle || "x" },
           ...this.curves.map((s, i) => ({ width: 1.5, points: { show: false }, ...s,

@@ -18,7 +18,8 @@ from plushsense.deploy.targets import TARGETS
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import download_address, path_in
 from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, button, html, moment, query, set_address, tag
+from plushsense.studio.app.shell import Page, address, button, html, moment, query, query_path, set_address, tag
+from plushsense.studio.app.stored_results import StoredResults, recommended
 from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import EXPORTS, plain_name
 from plushsense.studio.pages.export.exports import BundleFacts, ExportFacts, exports_of, formats, newest_job, targets
@@ -37,6 +38,7 @@ from plushsense.studio.widgets.elements import (
     titles,
     verdict,
 )
+from plushsense.studio.widgets.verdict import figures, show_choice
 
 _NEXT_STEPS: Texts = {
     "arduino": "Arduino and PlatformIO: copy the folder {arduino} to the libraries. An example is in {sketch}.",
@@ -391,8 +393,8 @@ class _Exporting:
                 ui.link(words("Train"), address("train")).classes("ps-link")
                 return
             options = {str(p): self._label(p) for p in bundles}
-            model = self.query.get("model", "")
-            first = model if model in options else str(bundles[0])
+            self._networks = await run.io_bound(self.workspace.part(StoredResults).networks) or {}
+            first = query_path(self.workspace, "model", options, recommended(self._networks)) or None
             select = ui.select(options, value=first, label=words("Network"), on_change=lambda e: self._choose(e.value))
             tag(select.classes("w-full"), "bundle")
             self._state = ui.column().classes("w-full")
@@ -430,7 +432,11 @@ class _Exporting:
         options = {"": words("From training, as stored in the network")} | await titles(self.workspace)
         self._dataset = ui.select(options, value="", label=words("Data set for the calibration")).classes("w-full")
 
-    async def _choose(self, path: str) -> None:
+    async def _choose(self, path: str | None) -> None:
+        if path is None:
+            with self._state:
+                show_choice(self.words, self._networks, path)
+            return
         chosen = await run.io_bound(lambda: BundleFacts.of(Path(path)))
         assert chosen is not None
         self.bundle = chosen
@@ -440,20 +446,21 @@ class _Exporting:
             if chosen.bundle is None:
                 tag(notice(self.words.sentence(chosen.problem or ""), "error"), "bundle-problem")
             else:
+                show_choice(self.words, self._networks, path, "text-bold")
                 if chosen.simulated:
                     notice(self.words("Simulation: these data say nothing about a real toy."))
                 if chosen.cannot:
                     tag(notice(self.words.sentence(chosen.cannot), "error"), "bundle-cannot")
         if chosen.bundle is not None:
             with self._about:
-                facts(self._facts_of(chosen.bundle, chosen.bytes))
+                facts(self._facts_of(chosen.path, chosen.bundle, chosen.bytes))
         self._name.set_value(self._free_name(Path(path).stem))
         self._allow()
 
     def _free_name(self, stem: str) -> str:
         return self.workspace.free_name(EXPORTS, plain_name(stem, "export"))
 
-    def _facts_of(self, bundle: Bundle, bytes_: int) -> list[tuple[str, str]]:
+    def _facts_of(self, path: Path, bundle: Bundle, bytes_: int) -> list[tuple[str, str]]:
         words, origin = self.words, bundle.provenance
         subjects, dataset = origin.get("subjects"), str(origin.get("dataset", ""))
         people = len(set(subjects) - {NOBODY, UNKNOWN_SUBJECT}) if isinstance(subjects, list) else int(subjects or 0)
@@ -467,19 +474,10 @@ class _Exporting:
             (words("Adapted to"), bundle.adapted_to or ""),
             (words("Size"), size(bytes_, words)),
         ]
-        scores = origin.get("scores")
-        if not isinstance(scores, dict) or scores.get("accuracy") is None:
+        score = self._networks.get(path)
+        if score is None or score.accuracy is None:
             return [*rows, (words("Scores"), words("the network has no scores"))]
-        value = words(
-            "accuracy {accuracy}, macro-F1 {f1}, windows: {windows}, split {split}",
-            accuracy=words.number(scores["accuracy"], 2),
-            f1=words.number(scores.get("macro_f1") or float("nan"), 2),
-            windows=scores.get("windows", "?"),
-            split=scores.get("split", "?"),
-        )
-        leaky = f" {words('(leaky: windows of the same recordings were trained on)')}" if scores.get("leaky") else ""
-        simulated = f" {words('(of virtual people: no result)')}" if origin.get("simulated") else ""
-        return [*rows, (words("Scores"), f"{value}{leaky}{simulated}")]
+        return [*rows, (words("Scores"), figures(words, score))]
 
     def _allow(self) -> None:
         """Enable the button while no export runs and the bundle can be read."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Message
-from plushsense.dataset.publishing.tables import list_package_files
+from plushsense.dataset.files import list_package_files
 from plushsense.deploy.code import FACTS, ModelFacts, read_facts
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.quantize import integer_model
@@ -67,7 +67,7 @@ class BundleFacts:
     @property
     def simulated(self) -> bool:
         """True if the bundle was trained on simulated data."""
-        return self.bundle is not None and bool(self.bundle.provenance.get("simulated", False))
+        return self.bundle is not None and self.bundle.simulated
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,13 @@ from plushsense.studio.pages.home.sections import (
 )
 from plushsense.studio.pages.home.toy import ToySection
 from plushsense.studio.widgets.elements import style
+from plushsense.studio.widgets.verdict import show_verdict
 
 _NEXT: Texts = {
-    "try": "There is nothing here yet. Try everything with a virtual toy: it takes a minute and needs no hardware.",
+    "try": (
+        "There is nothing here yet. Try everything with a virtual toy, without hardware: recordings take a minute, a "
+        "network at most ten."
+    ),
     "record": "A toy is chosen: record the first person.",
     "go_on": "Session {session} of {subject} is not finished.",
     "recording": "Session {session} of {subject} is being recorded.",
@@ -38,6 +42,10 @@ _NEXT: Texts = {
     "review": "Review the recordings of “{name}” before you train a network on them.",
     "more": "“{name}” holds one person only. Record more people, so that the network also works for new people.",
     "train": "“{name}” is ready: train a network on it.",
+    "improve": (
+        "The network “{name}” is not usable yet, because it may be guessing. Record two more people, or each gesture "
+        "two more times, then train again."
+    ),
     "live": "The network “{name}” is trained. Watch it live, or export it for the toy.",
 }
 
@@ -50,6 +58,7 @@ _NEXT_BUTTONS: Texts = {
     "review": "Review",
     "more": "Record",
     "train": "Train",
+    "improve": "Record",
     "live": "Watch it live",
     "export": "Export",
 }
@@ -80,6 +89,7 @@ def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], No
                     if entry.dataset:
                         facts.append(page.words("trained on “{name}”", name=entry.dataset))
                     ui.label(" · ".join(facts)).classes("ps-dim")
+                    show_verdict(page.words, entry.score)
                     with ui.row().classes("ps-small-gap"):
                         page_links(page, ("live", "export"), entry.name, model=entry.path)
 
@@ -167,7 +177,7 @@ async def show(page: Page) -> None:
     fill(summary or WorkspaceSummary())
     on_change(jobs.changed, update)
     on_change(toys.changed, step.update)
-    on_change(workspace.recording_changed, refresh)
+    on_change(toys.in_use_changed, refresh)
 
 
 class NextStepCard:
@@ -200,7 +210,7 @@ class NextStepCard:
                 if text := _NEXT_BUTTONS.get(step.key):
                     button("next-button", words(text), lambda: self._do(step), "unelevated size=lg color=primary")
                 if second := {"try": "record", "live": "export"}.get(step.key):
-                    button("", words(_NEXT_BUTTONS[second]), lambda: ui.navigate.to(address(second)))
+                    button("", words(_NEXT_BUTTONS[second]), lambda: self._go(second, step))
 
     def _do(self, step: NextStep) -> None:
         if step.key == "try":
@@ -208,7 +218,11 @@ class NextStepCard:
         elif step.key == "collect":
             self._collect()
         else:
-            ui.navigate.to(address(step.page))
+            self._go(step.page, step)
+
+    @staticmethod
+    def _go(page: str, step: NextStep) -> None:
+        ui.navigate.to(address(page, model=step.values.get("model", "")))
 
     def _collect(self) -> None:
         """Import the sessions that are in no data set; add them to one that fits, if there is one."""

@@ -23,11 +23,8 @@ from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Message
 from plushsense.dataset.files import person_folders
 from plushsense.dataset.importing.archives import UnpackLimits, member_target
-from plushsense.dataset.importing.results import SIMULATED
-from plushsense.dataset.importing.sources import LAYOUT_GUESSED
 from plushsense.dataset.privacy.removed import CONSENT, refuse_removed
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
-from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, heading, on_change, on_page, tag
@@ -58,6 +55,9 @@ def _about(file: str, note: Message) -> Message:
 
 def _is_of_preview(note: str | dict[str, Any]) -> bool:
     """Return whether the preview shows a note in another way."""
+    from plushsense.dataset.importing.results import SIMULATED
+    from plushsense.dataset.importing.sources import LAYOUT_GUESSED
+
     return isinstance(note, dict) and note["template"] in (SIMULATED.template, LAYOUT_GUESSED)
 
 
@@ -128,6 +128,8 @@ class Incoming:
 
     def _add_bundle(self, stored: Path) -> None:
         """Check an uploaded network, and move it to the networks of the studio."""
+        from plushsense.models.bundle import Bundle
+
         name = plain_name(stored.stem, "network")
         try:
             if stored.stat().st_size > BUNDLE_BYTES:

@@ -16,13 +16,13 @@ from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import parse_name
 from plushsense.core.sentences import Message
-from plushsense.dataset.importing.build import RECORDER
-from plushsense.dataset.marks import MARKS
+from plushsense.dataset.marks import MARKS, RECORDER
 from plushsense.dataset.privacy.removed import may_be_suggested
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
-from plushsense.models.bundle import Bundle
 from plushsense.recording.session import is_finished
 from plushsense.recording.writer import SessionHead
+from plushsense.studio.app.stored_results import ResultRow, StoredResults
+from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import BACKUPS, EXPORTS, Workspace, file_stamps
 
 INDEX = "recordings.csv"
@@ -79,7 +79,7 @@ class SessionEntry:
 
 @dataclass(frozen=True)
 class BundleEntry:
-    """Summary of a bundle (a model file); ``refused`` is the error message if it cannot be read."""
+    """Summary of a bundle (a model file) and its score; ``refused`` is the error message if it cannot be read."""
 
     path: Path
     name: str
@@ -87,6 +87,7 @@ class BundleEntry:
     gestures: int = 0
     simulated: bool = False
     refused: str = ""
+    score: ResultRow | None = None
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class NextStep:
     Attributes:
         key: key of the texts of the step and of its button, without prefix and suffix.
         page: page that the button opens; "" if there is no button or it starts an action.
-        values: values to fill into the text.
+        values: values to fill into the text; ``model`` is the network that the page opens.
     """
 
     key: str
@@ -157,7 +158,10 @@ def next_step(summary: WorkspaceSummary, *, toy: str = "", virtual: bool = False
     if unreviewed and all(b.simulated for b in bundles):
         # All bundles come from simulated data: continue with the real data.
         return NextStep("review", "review", {"name": unreviewed[0].name})
-    return NextStep("live", "live", {"name": bundles[0].name})
+    usable = next((b for b in bundles if b.score is not None and b.score.usable), None)
+    if usable is None:
+        return NextStep("improve", "record", {"name": bundles[0].name})
+    return NextStep("live", "live", {"name": usable.name, "model": usable.path})
 
 
 class Overview:
@@ -172,14 +176,16 @@ class Overview:
         """Return the current contents of the workspace."""
         with self._lock:
             datasets = tuple(self._cached(p, _dataset, HEAD, INDEX, MARKS) for p in self._workspace.datasets())
-            active = self._workspace.recording
+            active = {use.name for use in self._workspace.part(Toys).in_use}
             read = (_session(path, datasets) for path in self._workspace.sessions())
             home = self._workspace.folder
             sessions = tuple(
                 replace(s, active=f"{s.subject}/{s.session}" in active, removed=not may_be_suggested(home, s.subject))
                 for s in read
             )
-            bundles = tuple(self._cached(p, _bundle, "") for p in self._workspace.bundles())
+            scores = self._workspace.part(StoredResults).networks()
+            read_bundles = [self._cached(p, _bundle, "") for p in self._workspace.bundles()]
+            bundles = tuple(replace(b, score=scores.get(b.path)) for b in read_bundles)
         exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
         backups = tuple(sorted((self._workspace.folder / BACKUPS).glob("*.zip")))
         return WorkspaceSummary(datasets, sessions, bundles, exports, tuple(self._workspace.discarded()), backups)
@@ -262,11 +268,11 @@ def _session(path: Path, datasets: Iterable[DatasetEntry]) -> SessionEntry:
 
 
 def _bundle(path: Path) -> BundleEntry:
+    from plushsense.models.bundle import Bundle
+
     try:
         bundle = Bundle.load(path)
     except (PlushSenseError, OSError) as cause:
         return BundleEntry(path, path.stem, refused=_refusal(path, cause))
     origin = bundle.provenance
-    return BundleEntry(
-        path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bool(origin.get("simulated"))
-    )
+    return BundleEntry(path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bundle.simulated)

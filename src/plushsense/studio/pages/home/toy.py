@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from nicegui import ui
+from functools import partial
+from typing import Any
+
+from nicegui import run, ui
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.devices.opening import check_address, parse_url
-from plushsense.studio.app.shell import Kind, Page, button, message_row, on_change, on_page, tag
-from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, described, with_layout
+from plushsense.studio.app.shell import STOP_USE, Kind, Page, button, message_row, on_change, on_page, tag
+from plushsense.studio.app.toys import PERSONS, ToyInUseError, Toys, ToyTrial, ToyUse, described, with_layout
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.home.sections import SMALL, simulation_badge, titled_card
 from plushsense.studio.widgets.elements import errors_beside
@@ -65,10 +68,14 @@ class ToySection:
             self._try_out()
 
     def _try_out(self) -> None:
-        """Try the chosen toy, unless a recorder is using it."""
         self._page.say("")
-        if not self._page.workspace.recording:
-            self._toys.try_out()
+        self._toys.try_out()
+
+    async def _free(self, use: ToyUse) -> None:
+        """End what another page does with the toy, and try it."""
+        with self._page.show_errors():
+            await run.io_bound(use.stop)
+            self._try_out()
 
     def _update(self) -> None:
         self._show_chosen()
@@ -96,6 +103,8 @@ class ToySection:
                     fitting, url = trial.layout, with_layout(trial.url, trial.layout)
                     text = words("Use the sensors of {layout}", layout=fitting)
                     button("use-layout", text, on_page(lambda: self._choose(url)), "unelevated")
+                if trial is not None and isinstance(trial.error, ToyInUseError):
+                    button("stop-use", words(STOP_USE), on_page(partial(self._free, trial.error.use)), "unelevated")
                 test = button("test", words("Test the toy"), on_page(self._try_out))
                 test.set_enabled(trial is None or not trial.running)
 
@@ -109,10 +118,10 @@ class ToySection:
         if trial.error is not None:
             error = trial.error
             if isinstance(error, PlushSenseError):
-                return "error", words.error(error)
+                return "warning" if isinstance(error, ToyInUseError) else "error", words.error(error)
             return "error", words.failure(" ".join(str(error).split()) or type(error).__name__)
         assert result is not None
-        values = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
+        values: dict[str, Any] = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
         key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
         values |= {"frames": str(result.frames), "layout": result.layout, "malformed": str(result.malformed)}
         return ("good" if key == "good" else "warning"), words(_TESTS[key], **values)

@@ -10,7 +10,7 @@ from nicegui import ui
 
 from plushsense.reports.table import Table
 from plushsense.studio.app.shell import AFFECT_SIGNS, Page, add_style, button, html, moment, on_change, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import plain_name
 from plushsense.studio.pages.live.feed import VIEW_TEXTS
 from plushsense.studio.pages.live.live_state import EventSpan
@@ -26,6 +26,15 @@ _PRINT = """
   .lv-print tr { break-inside: avoid; } .lv-print * { border-color: #999 !important; color: #000 !important; }
 }
 """
+
+
+SIMULATIONS: Texts = {
+    "toy": "Simulation: these data say nothing about a real toy.",
+    "network": (
+        "Simulation: this network was trained on virtual people. What it says about a real toy proves nothing."
+    ),
+}
+"""Sentences on what is virtual, by `plushsense.studio.pages.live.live_state.SimulationKind`."""
 
 
 def log_table(events: Sequence[EventSpan]) -> Table:
@@ -72,11 +81,12 @@ def printed(words: Words, events: Sequence[EventSpan]) -> Markup:
         if virtual:
             row.append("" if event.really is None else words.gesture(event.really or words("nothing")))
         rows.append(row)
-    about, mark = words("No event yet."), words("Simulation: these data say nothing about a real toy.")
+    about = words("No event yet.")
     if events:
         when, networks = moment(events[0].session), ", ".join(dict.fromkeys(event.network for event in events))
         about = words("Session begun {when}. Network: {network}.", when=when, network=networks)
-    mark = mark if any(event.simulated for event in events) else ""
+    kinds = dict.fromkeys(event.simulated for event in events if event.simulated)
+    mark = " ".join(words(SIMULATIONS[kind]) for kind in kinds)
     return Markup("<h2>{}</h2><p>{}</p><p><b>{}</b></p>{}").format(
         words("Log of the session"), about, mark, table_html(head, rows, numbers=(4, 5)) if rows else ""
     )

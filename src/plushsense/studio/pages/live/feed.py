@@ -164,7 +164,7 @@ class Feed:
         now, device, bundle = reader.now, reader.device, reader.bundle
         self._generation = now.generation
         self._change = self._performed = 0
-        scene: FeedMessage = {"window": WINDOW_S, "strip": STRIP_S, "simulated": reader.choice.simulated}
+        scene: FeedMessage = {"window": WINDOW_S, "strip": STRIP_S}
         scene |= {"channels": [], "classes": [], "gate_rules": 0, "layout": "", "numbers": 0, "person": False}
         self._place = 0
         if device is not None and bundle is not None:

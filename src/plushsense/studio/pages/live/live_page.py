@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from nicegui import context, ui
+from nicegui import context, run, ui
 
 from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
 from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
-from plushsense.studio.app.toys import Toys, described, toy_title
+from plushsense.studio.app.stored_results import ResultRow, StoredResults, recommended
+from plushsense.studio.app.toys import ToyInUseError, Toys, described, toy_title
 from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL
 from plushsense.studio.pages.live import adapting, validation_page
-from plushsense.studio.pages.live.event_log import LogButtons
+from plushsense.studio.pages.live.event_log import SIMULATIONS, LogButtons
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
 from plushsense.studio.widgets.elements import notice, style, summary
+from plushsense.studio.widgets.verdict import show_choice
 
 _REACTIONS: Texts = {
     "standard": "green, or red if rough",
@@ -34,18 +36,21 @@ _REACTIONS: Texts = {
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
 
 
-def show(page: Page) -> None:
+async def show(page: Page) -> None:
     """Build the page."""
+    networks = await run.io_bound(page.workspace.part(StoredResults).networks) or {}
     reader = page.workspace.part(LiveReader)
     words = page.words
     style()
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
-        _Controls(page, reader, feed)
-    simulated = tag(notice(words("Simulation: these data say nothing about a real toy.")), "simulation")
+        _Controls(page, reader, feed, networks)
+    mark = tag(notice(""), "simulation")
 
     def update_mark() -> None:
-        simulated.set_visibility(reader.device is not None and reader.choice.simulated)
+        mark.set_visibility(bool(kind := reader.simulated))
+        if kind:
+            mark.set_content(words(SIMULATIONS[kind]))
 
     on_change(reader.changed, update_mark)
     update_mark()
@@ -100,8 +105,8 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
 class _Controls:
     """Fields for toy, network and settings, which are folded while a toy is read, and the buttons above them."""
 
-    def __init__(self, page: Page, reader: LiveReader, feed: Feed) -> None:
-        self._page, self._reader, self._feed = page, reader, feed
+    def __init__(self, page: Page, reader: LiveReader, feed: Feed, networks: Mapping[Path, ResultRow]) -> None:
+        self._page, self._reader, self._feed, self._networks = page, reader, feed, networks
         self._workspace, self._toys = page.workspace, page.workspace.part(Toys)
         words, choice = page.words, reader.choice
         self._state: tuple[Any, ...] = ()
@@ -118,8 +123,11 @@ class _Controls:
                 self._bundles = {str(path): path.stem for path in self._workspace.bundles()}
                 chosen = str(choice.bundle) if choice.bundle else None
                 if chosen is None or (query().get("model") and not reader.now.running):
-                    chosen = query_path(self._workspace, "model", self._bundles) or None
-                self._bundle = tag(ui.select(self._bundles, value=chosen, label=words("Network")), "bundle")
+                    chosen = query_path(self._workspace, "model", self._bundles, recommended(networks)) or None
+                with ui.column().classes("ps-no-gap"):
+                    box = ui.select(self._bundles, value=chosen, label=words("Network"))
+                    self._bundle = tag(box.classes("w-full"), "bundle")
+                    self._score = ui.column().classes("ps-no-gap ps-note")
                 names = {"": words(in_context("reactions", "none"))}
                 names |= {name: words(_REACTIONS.get(name, name)) for name in reaction_names()}
                 self._reactions = ui.select(names, value=choice.reactions, label=words("Reactions of the toy"))
@@ -134,12 +142,19 @@ class _Controls:
                 virtual = ui.checkbox(words("This is a virtual toy: a simulation"), value=choice.simulated)
                 self._simulated = tag(virtual, "simulated")
         self._toy.on_value_change(self._update_simulated)
+        self._bundle.on_value_change(self._show_score)
+        self._show_score()
         for control in (self._bundle, self._engine, self._reactions):
             control.on_value_change(self._change)
         on_change(reader.changed, self._update)
         on_change(self._toys.changed, self._update_toys)
         self._update_simulated()
         self._update()
+
+    def _show_score(self) -> None:
+        self._score.clear()
+        with self._score:
+            show_choice(self._page.words, self._networks, self._bundle.value)
 
     def _add_toy(self, label: str) -> None:
         reader, workspace = self._reader, self._workspace
@@ -166,10 +181,12 @@ class _Controls:
         self._page.say("")
         self._bundle.error = self._toy.error = None
         done = False
-        with self._page.show_errors():
+        with self._page.show_errors(lambda: self._run(command, *args)):
             try:
                 await asyncio.to_thread(command, *args)
                 done = True
+            except ToyInUseError:
+                raise
             except PlushSenseError as refusal:
                 of_network = isinstance(refusal, BundleError) or refusal.message.values.get("field") == "network"
                 field = self._bundle if of_network else self._toy

@@ -30,6 +30,10 @@ UNREAD: tuple[SituationKind, ...] = ("stopped", "connecting", "gone", "unreadabl
 """Situations in which no touch is read, so that nothing is known about the person and the toy."""
 
 
+SimulationKind = Literal["", "toy", "network"]
+"""What is virtual: nothing; the toy; the people on whom the network was trained, while the toy is real."""
+
+
 @dataclass(frozen=True)
 class LiveChoice:
     """The toy, bundle, engine and reactions in use.
@@ -61,7 +65,7 @@ class EventSpan:
         eyes, sound: the reaction of the toy; both "" while there is none.
         at: time of its first report, in seconds since 1970.
         network: name of the bundle that reported it.
-        simulated: whether the toy is virtual.
+        simulated: what is virtual.
         session: time of the start of the toy, in seconds since 1970.
         subject: code of the person, "" if none was given.
         really: the gesture that the virtual person made, "" for none; None for any other toy, and before the end.
@@ -80,7 +84,7 @@ class EventSpan:
     sound: str = ""
     at: float = 0.0
     network: str = ""
-    simulated: bool = False
+    simulated: SimulationKind = ""
     session: float = 0.0
     subject: str = ""
     really: str | None = None

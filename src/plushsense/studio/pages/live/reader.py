@@ -23,9 +23,16 @@ from plushsense.models.bundle import Bundle
 from plushsense.recording.writer import SessionHead
 from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.studio.app.toys import TappedDevice
+from plushsense.studio.app.toys import TappedDevice, Toys, ToyUse
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-from plushsense.studio.pages.live.live_state import Connection, EventSpan, LiveChoice, LiveState, quiet_reason
+from plushsense.studio.pages.live.live_state import (
+    Connection,
+    EventSpan,
+    LiveChoice,
+    LiveState,
+    SimulationKind,
+    quiet_reason,
+)
 
 KEPT_SPANS = 200
 KEPT_SPAN_S = 600.0
@@ -81,6 +88,7 @@ class LiveReader:
         self._malformed = 0
         self._notified_s = 0.0
         self._pages = 0
+        self._occupied: Callable[[], bool] = lambda: False
         self._alone: threading.Timer | None = None
 
     # Commands. They block, so call them outside the event loop -------------------------------------------
@@ -97,7 +105,9 @@ class LiveReader:
             reactor = _reactor(choice.reactions, bundle)
             url = with_speed(choice.toy, self._workspace.speed)
             self.stop()
-            device = TappedDevice(open_device(url, bundle.layout, reconnect=True))
+            use = ToyUse(choice.toy, "live", self._stop_for_others)
+            toys = self._workspace.part(Toys)
+            device = toys.open(use, lambda: open_device(url, bundle.layout, reconnect=True))
             try:
                 bundle_run = _BundleRun(bundle, run_on(device, classifier, warn=_kept), reactor)
             except BaseException:
@@ -118,6 +128,7 @@ class LiveReader:
                 target=self._read, args=(device, self._ends), name="plushsense-live", daemon=True
             )
             self._thread.start()
+        toys.update_uses()
         self.changed.notify()
 
     def choose(self, bundle: Path | None, engine: str, reactions: str) -> None:
@@ -156,6 +167,18 @@ class LiveReader:
                 thread.join(_JOIN_S)
             self._thread = None
 
+    def _stop_for_others(self) -> None:
+        if self._occupied():
+            raise ConfigError("A validation is under way. End it first.")
+        self.stop()
+
+    @property
+    def simulated(self) -> SimulationKind:
+        """What is virtual of the toy that is being read, or was last, and the network."""
+        if self.device is None or self.bundle is None:
+            return ""
+        return "toy" if self.choice.simulated else "network" if self.bundle.simulated else ""
+
     @property
     def person(self) -> VirtualDevice | None:
         """The toy that is being read, if it is a virtual one of this process, whose person can be directed."""
@@ -193,27 +216,28 @@ class LiveReader:
         """
         with self._lock:
             self._pages += 1
+            self._occupied = busy
 
         def leave() -> None:
             with self._lock:
                 self._pages -= 1
                 if self._pages == 0:
-                    self._wait_alone(busy)
+                    self._wait_alone()
 
         return leave
 
-    def _wait_alone(self, busy: Callable[[], bool]) -> None:
+    def _wait_alone(self) -> None:
         if self._alone is not None:
             self._alone.cancel()
-        self._alone = threading.Timer(ALONE_S, self._left_alone, (busy,))
+        self._alone = threading.Timer(ALONE_S, self._left_alone)
         self._alone.daemon = True
         self._alone.start()
 
-    def _left_alone(self, busy: Callable[[], bool]) -> None:
+    def _left_alone(self) -> None:
         if self._pages > 0:
             return
-        if busy():
-            self._wait_alone(busy)
+        if self._occupied():
+            self._wait_alone()
         else:
             self.stop()
 
@@ -354,7 +378,7 @@ class LiveReader:
                 event.source,
                 at=time.time(),
                 network=self.choice.bundle.stem if self.choice.bundle is not None else "",
-                simulated=self.choice.simulated,
+                simulated=self.simulated,
                 session=self._started,
                 subject=self.subject,
             )

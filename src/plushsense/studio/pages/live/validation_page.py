@@ -12,10 +12,12 @@ from typing import Any
 from nicegui import ui
 
 from plushsense.experiments.protocol.run_protocol import PAGE, TABLE, TRIALS
-from plushsense.experiments.protocol.score import NAMELESS
+from plushsense.experiments.protocol.score import NAMELESS, NOTES
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.shell import Page, button, html, moment, on_change, section, tag
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.live.adapting import PersonFields
+from plushsense.studio.pages.live.event_log import SIMULATIONS
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.validation import FOLDER, Validation
 from plushsense.studio.widgets.elements import notice, picture, scroll_to, summary, table
@@ -84,7 +86,7 @@ class _ValidationPanel:
             tag(self._repetitions, "validation-times")
             datasets = {str(p): page.workspace.title(p) for p in page.workspace.datasets()}
             rules = {"": words("nothing: without the rules")} | datasets
-            first = next(iter(datasets), "")
+            first = page.workspace.part(Choices).last("dataset", datasets)
             self._rules = ui.select(rules, value=first, label=words("Tune the old rules on")).classes("w-64")
             tag(self._rules, "validation-rules")
             noted = ui.checkbox(words("The toy has rules of its own: note its reactions"))
@@ -232,8 +234,9 @@ def _result_table(words: Words, result: Mapping[str, Any]) -> None:
     head = [words("Gesture")]
     head += [words(_HEADS[f"{system}_{what}"]) for system in nameless for what in ("answered", "time")]
     head += [words(_HEADS[key]) for key in ("answered", "answered_time", "named", "named_time", "likelihood")]
-    if result["simulated"]:
-        notice(words("Simulation: these data say nothing about a real toy.")).style("box-sizing: border-box")
+    by_network = NOTES["trained_virtual"] in result["said"]
+    if kind := "toy" if result["simulated"] else "network" if by_network else "":
+        notice(words(SIMULATIONS[kind])).style("box-sizing: border-box")
     ui.label(words(_NOTES[network])).classes("ps-dim ps-note")
     caption = words("People: {people}. Times are medians of the answered trials.", people=", ".join(result["people"]))
     table(caption, head, rows, range(1, len(head)))

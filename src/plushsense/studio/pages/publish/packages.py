@@ -15,12 +15,12 @@ from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.recorder_csv import SIMULATION_MARK
+from plushsense.dataset.files import list_package_files
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.publishing.checking import VALIDATORS
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE
 from plushsense.dataset.publishing.description import CHECKSUMS, REIDENTIFICATION_JSON
 from plushsense.dataset.publishing.keys import is_drawn
-from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import Dataset
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob

@@ -8,8 +8,9 @@ from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.store import Dataset
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.jobs import StudioJob
-from plushsense.studio.app.shell import Page, button, query, tag
+from plushsense.studio.app.shell import Page, button, query, query_path, tag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
@@ -92,8 +93,7 @@ class _Publishing:
                 none = words("There is no data set yet. Record a session, or import recordings on the home page.")
                 tag(text(none), "no-dataset")
                 return
-            dataset = self.query.get("dataset", "")
-            first = dataset if dataset in options else next(iter(options))
+            first = query_path(self.workspace, "dataset", options)
             select = ui.select(options, value=first, label=words("Data set"), on_change=lambda e: self._choose(e.value))
             tag(select.classes("w-full"), "dataset")
             self._rest = ui.column().classes("w-full")
@@ -104,6 +104,7 @@ class _Publishing:
         chosen = await run.io_bound(lambda: DatasetFacts.of(Path(path)))
         assert chosen is not None
         self.dataset = chosen
+        self.workspace.part(Choices).keep(dataset=path)
         self._rest.clear()
         with self._rest:
             if chosen.dataset is None:

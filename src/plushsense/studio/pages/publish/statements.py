@@ -12,7 +12,7 @@ from nicegui import run, ui
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.dataset.about import Contact, Creator
-from plushsense.dataset.index import change_head
+from plushsense.dataset.files import change_head
 from plushsense.dataset.publishing.description import LICENCES, find_licence
 from plushsense.dataset.publishing.package import missing_statements
 from plushsense.dataset.store import DatasetHead

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
-from plushsense.core.errors import ConfigError, DatasetError, LayoutError
+from plushsense.core.errors import ConfigError, DatasetError, LayoutError, PlushSenseError
 from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.sentences import Message
 from plushsense.core.toml import builtin_names
@@ -33,7 +35,7 @@ from plushsense.recording.session import (
     session_layout,
 )
 from plushsense.recording.writer import SESSION_HEAD, SessionHead
-from plushsense.studio.app.toys import TappedDevice
+from plushsense.studio.app.toys import TappedDevice, Toys, ToyUse
 from plushsense.studio.app.workspace import PROTOCOLS, VIRTUAL, ChangeSignal, Workspace
 
 LAYOUTS = "layouts"
@@ -69,6 +71,11 @@ class ActiveSession:
     def head(self) -> SessionHead:
         """The session's metadata."""
         return self.recorder.session.head
+
+    @property
+    def ended(self) -> bool:
+        """Whether all is recorded, or the toy is gone."""
+        return self.recorder.status().state in ("finished", "stopped")
 
     def press(self, key: str, seen: str) -> bool:
         """Run a command, but only if the status is still the displayed one; return whether it was run.
@@ -113,7 +120,9 @@ class RecordController:
         self.changed = ChangeSignal()
         self._workspace = workspace
         self._lock = threading.RLock()
-        self._opening = threading.Lock()
+        # Opening a toy may end another session, whose toy nobody is using any more.
+        self._opening = threading.RLock()
+        self._toys = workspace.part(Toys)
         self._active: dict[str, ActiveSession] = {}
 
     def active_sessions(self) -> list[ActiveSession]:
@@ -166,8 +175,7 @@ class RecordController:
     def _active_of(self, request: SessionRequest, subject: str) -> ActiveSession | None:
         """Return the active session of ``subject``, if any; first end finished ones of this person or toy."""
         for session in self.active_sessions():
-            ended = session.recorder.status().state in ("finished", "stopped")
-            if ended and (session.head.subject == subject or session.request.device == request.device):
+            if session.ended and (session.head.subject == subject or session.request.device == request.device):
                 self._end(session)
             elif session.head.subject == subject:
                 return session
@@ -251,9 +259,8 @@ class RecordController:
         self._changed()
 
     def _changed(self) -> None:
-        """Notify `changed`, and update the names of the sessions being recorded."""
-        running = [s.name for s in self.active_sessions() if s.recorder.status().state not in ("finished", "stopped")]
-        self._workspace.set_recording(running)
+        """Notify `changed`, and update which toys are in use."""
+        self._toys.update_uses()
         self.changed.notify()
 
     def close(self) -> None:
@@ -323,14 +330,15 @@ class RecordController:
     def _unknown(self, name: str) -> ConfigError:
         return ConfigError("There is no session {name}.", name=name)
 
-    def _tried(self, url: str, speed: float, layout: Layout | str | None) -> TappedDevice:
-        """Open a toy, and wait until it has sent frames.
+    def _tried(self, name: str, url: str, speed: float, layout: Layout | str | None) -> TappedDevice:
+        """Open a toy for the session ``name``, and wait until it has sent frames.
 
         Raises:
             DeviceError: if the toy cannot be opened, or sends no frames of the layout.
         """
         try:
-            device = TappedDevice(open_toy(with_speed(url, speed), layout))
+            use = ToyUse(url, "record", partial(self._stop_for_others, name), name, partial(self._is_busy, name))
+            device = self._toys.open(use, lambda: open_toy(with_speed(url, speed), layout))
         except LayoutError:
             raise LayoutError("The sensor layout “{name}” cannot be read. Choose another one.", name=layout) from None
         if isinstance(device.inner, VirtualDevice):
@@ -341,7 +349,21 @@ class RecordController:
         except BaseException:
             device.close()
             raise
+        with contextlib.suppress(PlushSenseError):  # a file that only this session may read
+            self._toys.choose(url)
         return device
+
+    def _is_busy(self, name: str) -> bool:
+        """Return whether a session is being opened or recorded."""
+        session = self.get(name)
+        return session is None or not session.ended
+
+    def _stop_for_others(self, name: str) -> None:
+        """Close a session, because its toy is needed elsewhere; raise ConfigError during a recording."""
+        session = self.get(name)
+        if session is not None and session.recorder.status().state in ("countdown", "recording", "saving"):
+            raise ConfigError("The session {name} is recording a gesture just now. Stop that first.", name=name)
+        self.close_session(name)
 
     def exchange(self, name: str, url: str) -> None:
         """Go on with another toy of the same layout in an active session; the former one stays if this fails.
@@ -368,7 +390,7 @@ class RecordController:
                     raise ConfigError("The session uses this toy already. Choose another one.")
                 # A port can be opened only once.
                 former.close()
-            device = self._tried(url, session.request.speed, recorder.session.layout)
+            device = self._tried(name, url, session.request.speed, recorder.session.layout)
             try:
                 recorder.exchange(device)
             except BaseException:
@@ -383,7 +405,8 @@ class RecordController:
         self, request: SessionRequest, folder: Path, known: SessionHead | None, lsl: bool = False
     ) -> ActiveSession:
         layout = session_layout(request, folder, known)
-        device = self._tried(request.device, request.speed, layout)
+        name = f"{folder.parent.name}/{folder.name}"
+        device = self._tried(name, request.device, request.speed, layout)
         try:
             head = session_head(request, folder, known is None, device.layout, SOFTWARE)
             notices = ((PSEUDO, is_pseudo_terminal(request, known or head)), (NO_CONSENT, lacks_consent(known or head)))
@@ -403,7 +426,7 @@ class RecordController:
             device.close()
             raise
         session = ActiveSession(
-            f"{folder.parent.name}/{folder.name}",
+            name,
             recorder,
             device,
             replace(request, subject=head.subject),

@@ -13,8 +13,9 @@ from nicegui import run, ui
 from plushsense.core.errors import AddressError, ConfigError, DeviceError, LayoutError, PlushSenseError
 from plushsense.recording.plan import DEFAULT, load_protocol, wordings
 from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary, check_subject
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.shell import Page, address, button, html, named, on_page, query, tag
-from plushsense.studio.app.toys import toy_title
+from plushsense.studio.app.toys import ToyInUseError, toy_title
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import CHILD, show_child
 from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
@@ -233,6 +234,8 @@ async def _settle_code(page: Page, code: str, use: Callable[[str], Awaitable[Non
 
 
 def _is_of_toy(error: PlushSenseError) -> bool:
+    if isinstance(error, ToyInUseError):
+        return False
     return isinstance(error, DeviceError | LayoutError | AddressError) or error.message.values.get("field") == "toy"
 
 
@@ -247,7 +250,7 @@ async def _open_session(
     begin.disable()
     page.say(page.words("Opening the toy …"))
     try:
-        with page.show_errors():
+        with page.show_errors(partial(_open_session, page, begin, work, refused)):
             try:
                 session = await run.io_bound(work)
             except PlushSenseError as error:
@@ -266,6 +269,7 @@ class _Form:
 
     def __init__(self, page: Page, controller: RecordController) -> None:
         self._page, self._controller, words = page, controller, page.words
+        self._choices = page.workspace.part(Choices)
         with tag(ui.column().classes("ps-card w-full"), "new-session"):
             html(words("New session"), "h2")
             with ui.row().classes("w-full items-start"):
@@ -279,7 +283,9 @@ class _Form:
                 self._age = _input("age_group", words("Age group"), age)
                 self._gender = _input("gender", words("Gender"), gender)
             with ui.row().classes("w-full items-start"):
-                self._protocol = _select(self._titles(), "protocol", words("What to record"), PROTOCOL)
+                titles = self._titles()
+                last = self._choices.last("protocol", titles, PROTOCOL)
+                self._protocol = _select(titles, "protocol", words("What to record"), last)
                 self._protocol.on_value_change(self._choose_words)
                 self._words = _select({DEFAULT: DEFAULT}, "wording", words("Wording"), DEFAULT)
                 self._discard = button("discard-protocol", words("Discard this list"), self._discard_protocol)
@@ -290,7 +296,8 @@ class _Form:
                 summary(words("More settings"))
                 with ui.column():
                     layouts = {"": words("Default (plush-15)")} | controller.layouts()
-                    self._layout = _select(layouts, "layout", words("Sensor layout of the toy"), "")
+                    layout = self._choices.last("layout", layouts)
+                    self._layout = _select(layouts, "layout", words("Sensor layout of the toy"), layout)
                     self._simulated = ui.checkbox(words("This is a virtual toy: mark the recordings as a simulation"))
                     self._anew = ui.checkbox(words("Begin a new session even if the person's last one is unfinished"))
                     mark = words("Mark the moment of the first start for the video (white flash and tone)")
@@ -319,7 +326,7 @@ class _Form:
         await change_files(self._page, lambda: workspace.discard(chosen), message, refresh, workspace.restore)
 
     def _choose_words(self) -> None:
-        """Update the selectable wordings to those of the chosen protocol; preselect the page's language."""
+        """Update the wordings to those of the chosen protocol; preselect the last one, or the page's language."""
         self._protocol.error = None
         self._discard.set_visibility(str(self._protocol.value).endswith(".toml"))
         try:
@@ -331,7 +338,7 @@ class _Form:
             self._protocol.error = self._page.words.error(refusal)
             known = (DEFAULT,)
         language = self._page.words.language
-        value = language if language in known else DEFAULT
+        value = self._choices.last("words", known, language if language in known else DEFAULT)
         self._words.set_options({w: self._page.words(_WORDINGS.get(w, w)) for w in known}, value=value)
 
     def _request(self) -> SessionRequest:
@@ -365,6 +372,7 @@ class _Form:
         self._subject.value = code
         with self._page.show_errors():
             request = self._request()
+            self._choices.keep(protocol=request.protocol, words=request.words, layout=str(request.layout or ""))
             anew, mark, lsl = bool(self._anew.value), bool(self._mark.value), bool(self._lsl.value)
             work = partial(self._controller.begin, request, anew, mark, lsl)
             await _open_session(self._page, self._begin, work, self._refused)

@@ -16,6 +16,7 @@ from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import SessionHead
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
+from plushsense.studio.app.toys import ToyInUseError
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.record.child import CHILD, ConnectionAlert, gesture_picture, style
 from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
@@ -330,13 +331,16 @@ class _View:
         words = self._page.words
         self._go_on.disable()
         self._page.say(words("Opening the toy …"))
-        try:
-            await run.io_bound(self._controller.exchange, self._session.name, self._toy.url)
-        except PlushSenseError as error:
-            self._page.say("")
-            self._toy.show_error(words.error(error))
-        finally:
-            self._go_on.enable()
+        with self._page.show_errors(self._exchange_toy):
+            try:
+                await run.io_bound(self._controller.exchange, self._session.name, self._toy.url)
+            except ToyInUseError:
+                raise
+            except PlushSenseError as error:
+                self._page.say("")
+                self._toy.show_error(words.error(error))
+            finally:
+                self._go_on.enable()
 
     async def _end(self, then: Callable[[], Awaitable[object]] | None = None) -> None:
         """End the session, and call ``then``, by default to go to the start page."""

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from nicegui import context, run, ui
 
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.selections import Selections
 from plushsense.studio.app.shell import Page, add_style, address, query, tag
 from plushsense.studio.pages.review.controller import DURATIONS, ONE, OVERLAY, STREAM, TABLE, ReviewController
@@ -39,7 +40,8 @@ async def show(page: Page) -> None:
     words, request, values = page.words, context.client.request, query()
     recordings = request.query_params.getlist("recordings") if request is not None else []
     datasets = page.workspace.datasets()
-    place = values.get("dataset") or (str(datasets[0]) if datasets else "")
+    choices = page.workspace.part(Choices)
+    place = values.get("dataset") or choices.last("dataset", map(str, datasets))
     with page.show_errors():
         place = str(page.workspace.inside(place)) if place else ""
     _choice_of_dataset(page, datasets, place)
@@ -56,6 +58,7 @@ async def show(page: Page) -> None:
         review: Review | None = await run.io_bound(reviews.open, place)
         if review is None:
             return  # the studio is ending
+        choices.keep(dataset=str(review.path))
         title = values.get("title", "")
         if values.get("selection"):
             selection = await run.io_bound(page.workspace.part(Selections).read, values["selection"])

@@ -10,18 +10,17 @@ from nicegui import ui
 
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, section, tag
-from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.job_requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
-from plushsense.studio.pages.train.stored_results import (
-    LINKS,
+from plushsense.studio.app.stored_results import (
     ResultRow,
     StoredResults,
     counted,
     duration_text,
     score_labels,
 )
-from plushsense.studio.pages.train.verdict import figures, headline, limits, people_table
+from plushsense.studio.app.words import Texts, Words
+from plushsense.studio.pages.train.job_requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
 from plushsense.studio.widgets.elements import JOB_STATES, KINDS_OF_TRAINING, Plot
+from plushsense.studio.widgets.verdict import figures, limits, network_links, people_table, show_verdict
 
 _CURVES_ABOUT: Texts = {
     "make": (
@@ -58,6 +57,8 @@ _STAGES: Texts = {
     "refitting": "training again, on everybody",
     "fine-tuning": "fine-tuning for 8 bits",
     "deciding": "fitting the decision settings",
+    "export": "writing the export",
+    "profile": "measuring the cost of a step",
     "evaluating": "testing on people left out",
     "learning": "measuring what more people would add",
 }
@@ -260,10 +261,11 @@ class _Card:
     def _plot(self, chart: ProgressChart) -> None:
         w = self._words
         title = w(_METRICS[chart.metric])
-        unit = {LOSS: "", ACCURACY: " (0–1)", BEST: " (0–1)"}[chart.metric]
+        share = chart.metric != LOSS
         x = w("Trainings done") if chart.metric == BEST else w("Epoch")
         drawn = self._lines(chart)
-        plot = Plot(f"{title}: {self._job.title}", drawn, x=x, y=title + unit, height=220)
+        label, y = f"{title}: {self._job.title}", f"{title} (0–1)" if share else title
+        plot = Plot(label, drawn, x=x, y=y, height=220, share=share)
         tag(plot, f"curve-{chart.metric}").begin(chart.x, chart.lines)
         self._plots.append((chart.metric, plot, chart.names))
 
@@ -284,7 +286,7 @@ class _Card:
         job, w = self._job, self._words
         if self._bar is not None and self._text is not None:
             at = job.progress
-            self._bar.set_value(min(1.0, float(at.get("share") or 0.0)))
+            self._bar.set_value(min(1.0, float(at.get("share", 1.0 if at else 0.0))))
             text = _progress_text(w, at)
             if self._text.text != text:
                 self._text.set_text(text)
@@ -298,10 +300,10 @@ class _Card:
         if len(job.warnings) != self._warned:
             self._warned = len(job.warnings)
             self._warnings.clear()
-            if job.warnings:
-                with self._warnings, ui.expansion(w("Good to know ({n})", n=len(job.warnings)), icon="info") as more:
+            if sentences := warning_texts(w, job):
+                with self._warnings, ui.expansion(w("Good to know ({n})", n=len(sentences)), icon="info") as more:
                     tag(more.classes("w-full"), "warnings")
-                    for sentence in warning_texts(w, job):
+                    for sentence in sentences:
                         ui.label(f"• {sentence}").classes("ps-break")
 
     def _buttons(self) -> None:
@@ -339,7 +341,7 @@ class _Card:
         marks = score_labels(w, row.leaky, row.simulated)
         if marks:
             tag(html(marks), "marks")
-        tag(ui.label(headline(w, row)).classes("ps-verdict-text"), "verdict")
+        show_verdict(w, row, "ps-verdict-text")
         for sentence in limits(w, row):
             ui.label(sentence)
         if row.simulated:
@@ -372,9 +374,11 @@ class _Card:
         job, w = self._job, self._words
         bundle = job.result.get("bundle") or _saved_bundle(job)
         if bundle and Path(bundle).is_file():
-            for to, text in LINKS.items():
-                link = ui.link(w(text), address(to, model=bundle)).classes("ps-link")
-                tag(link, f"to-{to}")
+            network_links(w, bundle)
+        place = Path(job.spec.get("place", ""))
+        if "files" in job.result and place.is_dir():
+            link = ui.link(w("Export “{name}”", name=place.name), address("export", name=place.name))
+            tag(link.classes("ps-link"), "to-exported")
 
 
 def _saved_bundle(job: StudioJob) -> str:

@@ -14,8 +14,9 @@ from plushsense.dataset.store import HEAD
 from plushsense.models.arch import parse_filters, parse_symbol
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import RUNNING, Jobs
+from plushsense.studio.app.stored_results import ResultRow
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import BUNDLES, Workspace
+from plushsense.studio.app.workspace import BUNDLES, EXPORTS, Workspace, plain_name
 from plushsense.workflow.config import RunConfig, from_settings
 
 MAKE, TRAIN, EVALUATE, SWEEP, SEARCH = "make", "train", "evaluate", "sweep", "search"
@@ -143,6 +144,18 @@ def _evaluate(workspace: Workspace, dataset: Path, given: Mapping[str, Any]) -> 
         command.append("--int8")
     title = workspace.title(dataset) + (f", {config.model.arch}" if config.model.arch else "")
     return JobRequest(EVALUATE, spec, title, shlex.join(command))
+
+
+def export_request(workspace: Workspace, jobs: Jobs, row: ResultRow) -> JobRequest:
+    """Return the job that trains a network with the settings of an evaluation on everybody, and exports it."""
+    name = free_name(workspace, jobs, workspace.title(Path(row.dataset)))
+    spec = {
+        "dataset": row.dataset,
+        "evaluation": str(row.proof),
+        "out": str(workspace.new(BUNDLES, f"{name}.plush")),
+        "place": str(workspace.new(EXPORTS, workspace.free_name(EXPORTS, plain_name(name, "export")))),
+    }
+    return JobRequest(TRAIN, spec, f"{name}: {workspace.title(Path(row.dataset))}, {row.network}", "")
 
 
 def _at(field: str, check: Callable[[], T], template: str = "") -> T:

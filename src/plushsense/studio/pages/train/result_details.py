@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ from markupsafe import Markup
 from nicegui import run, ui
 
 from plushsense.models.bundle import known_people
+from plushsense.reports.table import Table
+from plushsense.studio.app.jobs import Jobs
 from plushsense.studio.app.selections import Selections
 from plushsense.studio.app.shell import (
     AFFECT_SIGNS,
@@ -22,11 +25,9 @@ from plushsense.studio.app.shell import (
     scroll_region,
     tag,
 )
-from plushsense.studio.app.words import Words
-from plushsense.studio.pages.train.stored_results import (
+from plushsense.studio.app.stored_results import (
     EVALUATION,
     HELD_BACK,
-    LINKS,
     TRAINING,
     Confusion,
     MisreadRecording,
@@ -42,8 +43,11 @@ from plushsense.studio.pages.train.stored_results import (
     score_text,
     split_text,
 )
-from plushsense.studio.pages.train.verdict import figures, headline, limits
-from plushsense.studio.widgets.elements import table_html
+from plushsense.studio.app.words import Texts, Words
+from plushsense.studio.app.workspace import plain_name
+from plushsense.studio.pages.train.job_requests import export_request
+from plushsense.studio.widgets.elements import scroll_to, table_html
+from plushsense.studio.widgets.verdict import comparison, figures, limits, network_links, show_verdict
 
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
 
@@ -55,12 +59,14 @@ class ResultDetailsView:
         self._page, self._results, self._words = page, results, page.words
         self._place = tag(ui.column().classes("w-full"), "details")
         self._details: ResultDetails | None = None
+        self._others: list[ResultRow] = []
         self._by = "gesture"
         self._clicks = 0
 
     async def open(self, row: ResultRow) -> None:
         """Display the details of a result."""
         self._details = await run.io_bound(self._results.details, row)
+        self._others = await run.io_bound(self._results.comparable, row) or []
         self._draw()
         ui.run_javascript("setTimeout(() => document.querySelector('[data-test=details]')?.scrollIntoView(), 60)")
 
@@ -84,7 +90,7 @@ class ResultDetailsView:
                 icon_button("close", w("Close"), self._close, color=None)
             if row.leaky:
                 ui.label(leaky_warning(w))
-            tag(ui.label(headline(w, row)).classes("text-bold"), "details-verdict")
+            show_verdict(w, row, "text-bold")
             for sentence in limits(w, row):
                 ui.label(sentence)
             tag(ui.label(figures(w, row)).classes("ps-dim"), "details-figures")
@@ -92,6 +98,7 @@ class ResultDetailsView:
             ui.label(w("{parameters} parameters, {macs} multiply-accumulates in 50 ms.", **sizes)).classes("ps-dim")
             if row.kind == TRAINING:
                 self._training(d)
+            self._tools(d)
             if d.by_gesture is not None:
                 self._confusions(d)
             elif d.later:
@@ -119,6 +126,10 @@ class ResultDetailsView:
     def _training(self, d: ResultDetails) -> None:
         w, facts = self._words, d.facts
         checked = sorted(known_people(facts, ["validation_subjects"]))
+        if d.row.proof is not None:
+            trained = counted(w, "with_people", len(known_people(facts, ["subjects"])))
+            ui.label(w("Trained on {trained}. The score is that of the evaluation of these settings.", trained=trained))
+            return
         held_back = (
             "Checked on {checked} ({names}) before it was trained again on all {trained}."
             if facts.get("refit")
@@ -133,9 +144,85 @@ class ResultDetailsView:
             names=", ".join(checked) or "–",
         )
         ui.label(text)
-        with ui.row():
-            for to, text in LINKS.items():
-                ui.link(w(text), address(to, model=d.row.path)).classes("ps-link")
+
+    # What to take away ----------------------------------------------------------------------------------------
+
+    def _tools(self, d: ResultDetails) -> None:
+        """Add downloads, links to the pages that use the network or the button to make one, and a comparison."""
+        w, row = self._words, d.row
+        kinds: Texts = {
+            **({"html": "Save the report (HTML)"} if d.report else {}),
+            **({"csv": "Save the confusions (CSV)", "png": "Save the confusions (PNG)"} if d.by_gesture else {}),
+            **({"plush": "Save the network (.plush)"} if row.bundle else {}),
+        }
+        with ui.row().classes("items-center ps-small-gap"):
+            if row.bundle is not None:
+                network_links(w, row.bundle)
+            elif row.proof is not None and row.usable:
+                make = w("Train on everybody and export")
+                button("make-export", make, self._make_export, "unelevated", icon="memory")
+            for kind, text in kinds.items():
+                button(f"save-{kind}", w(text), partial(self._save, kind), icon="download")
+        if self._others:
+            with ui.row().classes("items-center w-full"):
+                others = {
+                    r.id: " · ".join((r.network, r.schedule, split_text(w, r.split), figure(w, r.accuracy)))
+                    for r in self._others
+                }
+                label = w("Compare person by person with")
+                box = ui.select(others, label=label, on_change=lambda event: self._compare(d, event.value))
+                tag(box.classes("w-full"), "compare-with")
+                self._comparison = tag(ui.label().props('role="status"'), "comparison")
+
+    async def _save(self, kind: str) -> None:
+        """Let the browser save the report, the displayed confusions or the network."""
+        d, confusion = self._details, self._confusion()
+        assert d is not None
+        title = ", ".join((d.row.data, split_text(self._words, d.row.split)))
+        if d.row.simulated:
+            title += f" ({self._words('simulation')})"
+
+        def content() -> bytes:
+            if kind in ("html", "plush"):
+                path = d.report if kind == "html" else d.row.bundle
+                assert path is not None
+                return path.read_bytes()
+            assert confusion is not None
+            if kind == "png":
+                from plushsense.reports.figures import confusion as draw_confusion
+                from plushsense.reports.figures import png
+
+                return png(draw_confusion(confusion.labels, confusion.counts, title=title), 200)
+            rows = [
+                {"true": label, **dict(zip(confusion.labels, counts, strict=True))}
+                for label, counts in zip(confusion.labels, confusion.counts, strict=True)
+            ]
+            return Table.from_rows("confusion", "", rows).csv().encode()
+
+        with self._page.show_errors():
+            name = plain_name(f"{d.row.data} {d.row.network}", "result")
+            found = await run.io_bound(content)
+            if found is not None:
+                ui.download.content(found, f"{name}.{kind}")
+
+    def _make_export(self) -> None:
+        """Start to train a network with the settings of the evaluation on everybody, and to export it."""
+        d, workspace = self._details, self._page.workspace
+        assert d is not None
+        with self._page.show_errors():
+            jobs = workspace.part(Jobs)
+            request = export_request(workspace, jobs, d.row)
+            jobs.start(request.task, request.spec, request.title)
+            scroll_to("job")
+
+    async def _compare(self, d: ResultDetails, identity: str) -> None:
+        from plushsense.experiments.analysis.comparison import compare
+
+        other = next(r for r in self._others if r.id == identity)
+        with self._page.show_errors():
+            found = await run.io_bound(compare, [str(d.row.proof), str(other.proof)])
+            if found is not None:
+                self._comparison.set_text(comparison(self._words, found.pairs["accuracy"][0], len(found.people)))
 
     # Confusions -----------------------------------------------------------------------------------------------
 

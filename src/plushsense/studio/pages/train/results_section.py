@@ -15,9 +15,7 @@ from nicegui import run, ui
 
 from plushsense.scoring.metrics import pareto_front
 from plushsense.studio.app.shell import Page, heading, html, named, scroll_region, section, tag
-from plushsense.studio.app.words import Texts, Words, in_context
-from plushsense.studio.pages.train.result_details import ResultDetailsView
-from plushsense.studio.pages.train.stored_results import (
+from plushsense.studio.app.stored_results import (
     EVALUATION,
     TRAINING,
     TRIAL,
@@ -29,6 +27,8 @@ from plushsense.studio.pages.train.stored_results import (
     score_text,
     split_text,
 )
+from plushsense.studio.app.words import Texts, Words, in_context
+from plushsense.studio.pages.train.result_details import ResultDetailsView
 from plushsense.studio.widgets.elements import table_html
 
 _COLUMNS: Texts = {
@@ -314,7 +314,8 @@ def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, object]:
     for row in rows:
         if row.macro_f1_sd is not None:
             score = row.macro_f1 or 0.0
-            bars += [[row.parameters, score - row.macro_f1_sd], [row.parameters, score + row.macro_f1_sd], [None, None]]
+            low, high = max(0.0, score - row.macro_f1_sd), min(1.0, score + row.macro_f1_sd)
+            bars += [[row.parameters, low], [row.parameters, high], [None, None]]
     points = [_point(w, row, row.id in ids, math.sqrt(low_x * high_x)) for row in rows]
     line = {"type": "line", "showSymbol": False, "silent": True, "emphasis": {"disabled": True}}
     return {
@@ -333,6 +334,8 @@ def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, object]:
         "yAxis": {
             "type": "value",
             "scale": True,
+            # Above 0.9, an axis that is chosen by the values can end beyond 1.
+            **({"max": 1} if max(row.macro_f1 or 0.0 for row in rows) > 0.9 else {}),
             "axisLabel": {":formatter": _SCORE % w.decimal_point, "color": _INK},
             **_axis(w("Macro-F1 (0 to 1)"), 48),
         },

@@ -12,8 +12,16 @@ from nicegui import context, run, ui
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS, VECTOR_FILTERS, VECTOR_SYMBOL
 from plushsense.scoring.splits import parse_split
+from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, add_style, button, focus, html, on_change, query_path, section, tag
+from plushsense.studio.app.stored_results import (
+    StoredResults,
+    counted,
+    duration_text,
+    leaky_warning,
+    score_labels,
+)
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.train.job_cards import JobsSection, warning_texts
 from plushsense.studio.pages.train.job_requests import (
@@ -32,15 +40,8 @@ from plushsense.studio.pages.train.job_requests import (
     job_request,
 )
 from plushsense.studio.pages.train.results_section import ResultsSection
-from plushsense.studio.pages.train.stored_results import (
-    StoredResults,
-    counted,
-    duration_text,
-    leaky_warning,
-    score_labels,
-)
-from plushsense.studio.pages.train.verdict import FEW_PEOPLE
-from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, scroll_to
+from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, notice, scroll_to
+from plushsense.studio.widgets.verdict import FEW_PEOPLE
 from plushsense.training.spec import DEVICES, PRESETS
 from plushsense.windows.cut import ANYWHERE, CONTEXTS, TRAIN_CONTEXTS
 
@@ -116,6 +117,8 @@ _SPLITS: Texts = {
     "default": "as in the list",
 }
 
+# Gestures with a single recording that are named.
+_LISTED = 5
 # Budget of *Make a network*, if nothing else is given.
 _MINUTES = 10
 # Fields are as wide as their longest choice, or as the page on a phone.
@@ -215,6 +218,7 @@ class TrainingForm:
         """Read and display the counts of the chosen data set."""
         if not self._dataset:
             return
+        self._page.workspace.part(Choices).keep(dataset=self._dataset)
         self._facts.clear()
         with self._page.show_errors():
             facts = await run.io_bound(self._results.facts, self._page.workspace.inside(self._dataset))
@@ -229,6 +233,16 @@ class TrainingForm:
                     ui.label(w("Simulation: these data say nothing about a real toy.")).classes("ps-dim")
                 if 0 < facts.people < FEW_PEOPLE:
                     ui.label(w("With so few people, every score is uncertain.")).classes("ps-dim")
+            if facts.once:
+                text = w(
+                    "There is only one recording of: {gestures}. A network cannot learn from one recording and be "
+                    "tested on another: record each gesture at least two more times before you train.",
+                    gestures=", ".join(
+                        [*map(w.gesture, facts.once[:_LISTED]), *("…" for _ in facts.once[_LISTED:][:1])]
+                    ),
+                )
+                with self._facts:
+                    tag(notice(text), "recorded-once")
             if not facts.streams and self._values[TRAIN]["context"] == ANYWHERE:
                 self._values[TRAIN]["context"] = "loop"
                 self._build()

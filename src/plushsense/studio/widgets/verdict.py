@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
+from nicegui import ui
 
-from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.train.stored_results import (
-    EVALUATION,
+from plushsense.scoring.comparison import LEVEL, PairResult
+from plushsense.studio.app.shell import address, tag
+from plushsense.studio.app.stored_results import (
     HELD_BACK,
+    PERSONAL,
     SUBJECTS,
     TRAINING,
     TRIAL,
@@ -20,20 +23,36 @@ from plushsense.studio.pages.train.stored_results import (
     figure,
     score_text,
 )
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.widgets.elements import table_html
 
 _VERDICTS: Texts = {
     "new": "It reads about {right} of 10 touches of people it never met; guessing gives {chance} of 10.",
+    "new_one": "It reads about {right} of 10 touches of one person it never met; guessing gives {chance} of 10.",
     "known": (
         "It reads about {right} of 10 moments, with those at rest, of people it knows; guessing gives {chance} of "
         "10. Expect less with new people."
+    ),
+    "known_one": (
+        "It reads about {right} of 10 moments, with those at rest, of the one person it knows; guessing gives {chance} "
+        "of 10. Expect less with new people."
     ),
     "leaky": (
         "Here it reads about {right} of 10 moments, with those at rest, but this test is too easy: parts of the same "
         "touches were trained on. Guessing gives {chance} of 10."
     ),
+    "unusable": "Not usable yet, because it may be guessing: record two more people, or each gesture two more times.",
 }
 
+_LINKS: Texts = {"live": "Try it live", "export": "Export for the toy"}
+_OUTCOMES: Texts = {
+    "this": "So this network is better, beyond chance.",
+    "other": "So the other network is better, beyond chance.",
+    "chance": "So the difference may be chance.",
+    "few": "So the difference may be chance: with so few people, this test cannot tell.",
+}
+FEW_PAIRS = 6
+"""With fewer people than this, a paired permutation test never gives a p-value below 0.05."""
 FEW_PEOPLE = 10
 """With fewer people than this, a score may be far from that of others."""
 
@@ -45,10 +64,58 @@ def of_ten(w: Words, share: float) -> str:
 
 def headline(w: Words, row: ResultRow) -> str:
     """Return the main sentence on a result."""
+    if row.split == PERSONAL:
+        return w("It is adapted to one person. How well it reads others is not known.")
     if row.accuracy is None or not row.classes:
         return w("This result has no score.")
-    kind = "leaky" if row.leaky else "new" if _is_apart(row) else "known"
-    return w(_VERDICTS[kind], right=of_ten(w, row.accuracy), chance=of_ten(w, 1 / row.classes))
+    kind = "leaky" if row.leaky else "new" if row.apart_people else "known"
+    one = (row.units if row.spread in (SUBJECTS, HELD_BACK) else len(row.people)) == 1 and not row.leaky
+    return w(_VERDICTS[f"{kind}_one" if one else kind], right=of_ten(w, row.accuracy), chance=of_ten(w, row.chance))
+
+
+def show_verdict(w: Words, row: ResultRow | None, look: str = "") -> None:
+    """Add the main sentence on a network or another result; in red, with what to do, if it may be guessing."""
+    if row is None:
+        return
+    bad = "" if row.usable or row.leaky or row.accuracy is None else " ps-bad"
+    tag(ui.label(headline(w, row)).classes(look + bad), "score")
+    if bad:
+        tag(ui.label(w(_VERDICTS["unusable"])).classes(f"text-bold{bad}"), "not-usable")
+
+
+def show_choice(w: Words, networks: Mapping[Path, ResultRow], chosen: str | None, look: str = "") -> None:
+    """Add the verdict on the network that is chosen on a page, or why none is chosen there at first."""
+    if chosen:
+        show_verdict(w, networks.get(Path(chosen)), look)
+    elif networks:
+        tag(ui.label(w("None of the networks is surely better than guessing, so none is chosen.")), "none-chosen")
+
+
+def network_links(w: Words, bundle: str | Path) -> None:
+    """Add links from a network to the pages that use it."""
+    for to, message in _LINKS.items():
+        tag(ui.link(w(message), address(to, model=bundle)).classes("ps-link"), f"to-{to}")
+
+
+def comparison(w: Words, pair: PairResult, people: int) -> str:
+    """Return the sentences on two networks that were tested on the same people; the first is "this network"."""
+    assert pair.difference.mean is not None and pair.difference.ci95 is not None
+    low, high = pair.difference.ci95
+    text = w(
+        "Compared on {people}: this network reads {better} of them better than the other one, and {worse} worse. Its "
+        "accuracy minus that of the other one is {difference} on average (95 % interval: {low} to {high}; paired "
+        "permutation test over people: p = {p}).",
+        people=counted(w, "people", people),
+        better=pair.better,
+        worse=pair.worse,
+        p=w.number(pair.p, 3),
+        difference=figure(w, pair.difference.mean),
+        low=figure(w, low),
+        high=figure(w, high),
+    )
+    better = "this" if pair.difference.mean > 0 else "other"
+    outcome = better if pair.p < LEVEL else "few" if people < FEW_PAIRS else "chance"
+    return f"{text} {w(_OUTCOMES[outcome])}"
 
 
 def limits(w: Words, row: ResultRow) -> list[str]:
@@ -58,7 +125,7 @@ def limits(w: Words, row: ResultRow) -> list[str]:
         return found
     people = row.units if row.spread in (SUBJECTS, HELD_BACK) else 0
     if row.interval is not None and row.spread == SUBJECTS:
-        low, high = (w.number(10 * max(0.0, edge), 1) for edge in row.interval)
+        low, high = (w.number(10 * edge, 1) for edge in row.interval)
         found.append(
             w(
                 "Measured on {people}. For other people like them, the average is probably between {low} and {high} "
@@ -74,18 +141,13 @@ def limits(w: Words, row: ResultRow) -> list[str]:
         )
     if row.kind == TRIAL:
         found.append(w("It is the best of several networks on the same people, so its score is slightly too good."))
-    if row.kind == TRAINING:
+    if row.kind == TRAINING and row.proof is None:
         found.append(
             w("This is the check during training. Report the score of an evaluation, which tests every person.")
         )
-    if row.kind == EVALUATION and _is_apart(row):
+    if row.proof is not None and row.apart_people:
         found.append(_more_people(w, row.learning))
     return found
-
-
-def _is_apart(row: ResultRow) -> bool:
-    """Return whether nobody in the test was trained on."""
-    return row.split.startswith(("leave-one-subject-out", "by-subject", "validation-subjects"))
 
 
 def _more_people(w: Words, learning: Mapping[str, Any] | None) -> str:
@@ -136,5 +198,5 @@ def people_table(w: Words, row: ResultRow) -> Markup:
     rows = [line(name, value) for name, value in row.people]
     if row.spread == SUBJECTS:
         rows.append(line(w("Mean"), row.accuracy))
-    rows.append(line(w("Guessing"), 1 / row.classes if row.classes else None))
+    rows.append(line(w("Guessing"), row.chance))
     return table_html([w("Person"), w("Accuracy"), ""], rows, numbers=(1,), row_heads=True)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import math
+import multiprocessing
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -27,7 +30,7 @@ from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import Workspace, file_stamps
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.preparation import WHOLE_PEOPLE
-from plushsense.workflow.reporting import LEARNING, PREDICTIONS, SCORES, load_evaluation
+from plushsense.workflow.reporting import LEARNING, PAGE, PREDICTIONS, SCORES, load_evaluation
 
 _OVER: Texts = {"trainings": "{n} (folds × seeds)", "held_back": "{n} held back"}
 _MARKS: Texts = {"simulation": "simulation", "leaky": "leaky"}
@@ -39,6 +42,7 @@ _SPLITS: Texts = {
     "windows:holdout": "15 % of the windows",
     "validation-subjects": "people held back",
     "validation-recordings": "recordings held back, known people",
+    "personal": "adapted to one person",
 }
 
 _CONTEXTS: Texts = {
@@ -48,9 +52,6 @@ _CONTEXTS: Texts = {
     "anywhere": "for live use",
     "inside": "within the gesture",
 }
-
-LINKS: Texts = {"live": "Try it live", "export": "Export for the toy"}
-"""Links from a network to the pages that use it."""
 
 
 def figure(words: Words, value: float | None) -> str:
@@ -111,6 +112,8 @@ def context_text(words: Words, context: str) -> str:
 
 
 EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
+PERSONAL = "personal"
+"""Split of a network that is adapted to a person: nothing was tested on others."""
 SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
 _COUNTS: Texts = {
     "people": "{n:person}",
@@ -126,6 +129,8 @@ _COUNTS: Texts = {
 }
 _UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK: "people"}
 _HASH = 6
+# 97.5th percentile of the normal distribution.
+_Z95 = 1.959964
 # Limits of results that are read: a folder of results may come from elsewhere.
 _MOST_BYTES, _MOST_LABELS, _LONGEST_TEXT, _LAST_S = 1 << 26, 256, 1000, 1e11
 _READ_ERRORS = (
@@ -147,11 +152,15 @@ class ResultRow:
         macs: number of multiply-accumulate operations per decision, every 50 ms.
         when_s: time of the result, in seconds since 1970.
         classes: number of gestures that the network tells apart.
-        interval: 95 % interval of the mean accuracy.
+        chance: accuracy of guessing: one of the gestures, or always the most frequent one if rest is counted.
+        interval: 95 % interval of the mean accuracy, see `score_interval`.
         people: accuracy of each person of an evaluation.
         rest: accuracy of recordings at rest if they are scored apart, as where whole people are left out.
         learning: see `plushsense.workflow.budget.learning_curve`.
         apart: further values that are equal in comparable results: hash of the data set, classes, held-back people.
+        settings: hash of the data set and all settings of the training; equal for a network and its evaluation.
+        proof: folder of the evaluation that gives the score; None if it is that of a training or a trial.
+        bundle: the network, of an evaluation the newest one with its settings; None if there is none.
     """
 
     id: str
@@ -178,16 +187,36 @@ class ResultRow:
     when_s: float
     apart: tuple[str, ...] = ()
     classes: int = 0
+    chance: float = 0.0
     interval: tuple[float, float] | None = None
     people: tuple[tuple[str, float | None], ...] = ()
     rest: float | None = None
     learning: dict[str, Any] | None = None
+    settings: str = ""
+    proof: Path | None = None
+    bundle: Path | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether the network may be recommended: its score is above guessing beyond its uncertainty, and not leaky."""
+        return not self.leaky and self.interval is not None and self.interval[0] > self.chance
+
+    @property
+    def apart_people(self) -> bool:
+        """Whether nobody in the test was trained on."""
+        return self.split.startswith(("leave-one-subject-out", "by-subject", WHOLE_PEOPLE))
+
+    @property
+    def paired(self) -> bool:
+        """Whether there are scores of several people, none of whom was trained on."""
+        return self.proof is not None and self.apart_people and len(self.people) > 1
 
     def __post_init__(self) -> None:
         """Raise ValueError if a value, which a file may have given, has another type or range."""
         people = dict(self.people)
         texts = (self.data, self.network, self.schedule, self.split, self.context, self.seeds, *self.apart, *people)
-        shares = (self.accuracy, self.accuracy_sd, self.macro_f1, self.macro_f1_sd, self.rest, *people.values())
+        scores = (self.accuracy, self.accuracy_sd, self.macro_f1, self.macro_f1_sd, self.rest, self.chance)
+        shares = (*scores, *people.values())
         counts = (self.units, self.macs, self.classes, self.parameters - 1)
         right = all(isinstance(text, str) and len(text) <= _LONGEST_TEXT for text in texts)
         right &= all(value is None or (_is_number(value) and 0.0 <= value <= 1.0) for value in shares)
@@ -205,6 +234,27 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and math.isfinite(value)
 
 
+def score_interval(accuracy: Any, trials: float, over_people: Any = None) -> tuple[float, float] | None:
+    """Return the 95 % interval of an accuracy; None if nothing was tested.
+
+    It is the wider one, at each end, of Wilson's interval for ``trials`` independent answers, and of the interval over
+    people or folds, which is too narrow, or a single point, if there are few of them.
+    """
+    if accuracy is None or trials < 1.0:
+        return None
+    z2 = _Z95**2
+    middle = (accuracy + z2 / (2.0 * trials)) / (1.0 + z2 / trials)
+    half = _Z95 * math.sqrt(accuracy * (1.0 - accuracy) / trials + z2 / (4.0 * trials**2)) / (1.0 + z2 / trials)
+    low, high = over_people or (middle, middle)
+    return max(0.0, min(low, middle - half)), min(1.0, max(high, middle + half))
+
+
+def _settings(hash_: object, context: object, preset: object, training: Mapping[str, Any], network: object) -> str:
+    """Return a text for the data and the settings of a training, without those of the computer."""
+    how = sorted((key, value) for key, value in training.items() if key not in ("device", "threads"))
+    return repr((hash_, context, preset, how, network))
+
+
 def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
     """Read the result in the scores file ``path`` of an evaluation, as a list of one row."""
     table = load_evaluation(path)
@@ -214,6 +264,12 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
     if table["train_context"] != context:
         context = f"{table['train_context']} → {context}"
     units = len(table[table["over"]])
+    accuracy, apart = table["accuracy"], table["over"] == SUBJECTS
+    classes, support = len(table["per_class"]), [one["support"] for one in table["per_class"]]
+    people = table["subjects"]
+    # Recordings at rest, of which there are more, are scored apart where people are left out.
+    recordings = sum(one["recordings"] for one in people) if apart else table["by_recording"]["recordings"]
+    network = (model["symbol"], *model["filters"], model["padding"], model.get("norm"))
     return [
         ResultRow(
             str(path.parent),
@@ -229,21 +285,24 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
             bool(table["leaky"]),
             bool(table["simulated"]),
             ", ".join(map(str, table["seeds"])),
-            SUBJECTS if table["over"] == SUBJECTS else FOLDS,
+            SUBJECTS if apart else FOLDS,
             units,
-            table["accuracy"]["mean"],
-            table["accuracy"]["sd"],
+            accuracy["mean"],
+            accuracy["sd"],
             table["macro_f1"]["mean"],
             table["macro_f1"]["sd"],
             model["parameters"],
             model["macs_per_step"],
             path.stat().st_mtime,
             (str(table["dataset"]["hash"])[:_HASH], *(str(one["label"]) for one in table["per_class"])),
-            len(table["per_class"]),
-            None if table["accuracy"]["ci95"] is None else tuple(table["accuracy"]["ci95"]),
-            tuple((one["subject"], one["accuracy"]) for one in table["subjects"]),
-            _rest(table["nobody"], table["over"] == SUBJECTS),
+            classes,
+            1 / classes if apart else max(support) / max(1, sum(support)),
+            score_interval(accuracy["mean"], recordings, accuracy["ci95"]),
+            tuple((one["subject"], one["accuracy"]) for one in people),
+            _rest(table["nobody"], apart),
             table["learning"],
+            _settings(table["dataset"]["hash"], table["train_context"], config["preset"], training, network),
+            path.parent,
         )
     ]
 
@@ -285,6 +344,7 @@ def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
                     when,
                     apart,
                     len(table["labels"]),
+                    1 / len(table["labels"]),
                 )
             )
     return rows
@@ -294,8 +354,9 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
     """Read the result stored in a bundle, as a list of one row; ``known`` maps names of data sets to folders."""
     bundle = Bundle.load(path)
     origin = bundle.provenance
-    scores, training = origin.get("scores", {}), origin.get("training", {})
-    arch = bundle.arch
+    # What is known about a network before it was adapted to a person does not hold for it.
+    scores: dict[str, Any] = {"split": PERSONAL} if bundle.personal else origin.get("scores", {})
+    arch, training = bundle.arch, origin.get("training", {})
     name = str(origin.get("dataset", "?"))
     split = str(scores.get("split", origin.get("split", "?")))
     context = bundle.windowing.get("context", "?")
@@ -303,6 +364,10 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
         # As in evaluations, networks trained on any context are scored in the context "stream".
         context = f"{ANYWHERE} → stream"
     held_back = sorted(known_people(origin, ["validation_subjects"]))
+    window_s, step_s = (float(bundle.windowing.get(key) or 1.0) for key in ("window_s", "step_s"))
+    trials = scores.get("windows", 0) * min(1.0, step_s / window_s)
+    network = (arch.symbol, *arch.filters, arch.padding, arch.norm)
+    used = (origin.get("dataset_hash"), bundle.windowing.get("context"), origin.get("preset"), training, network)
     return [
         ResultRow(
             str(path),
@@ -316,7 +381,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             split,
             str(context),
             bool(scores.get("leaky")),
-            bool(origin.get("simulated")),
+            bundle.simulated,
             str(training.get("seed", "?")),
             # Unless whole people were held back, the network was trained on the people it was scored on.
             *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
@@ -329,9 +394,21 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             path.stat().st_mtime,
             (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
             len(bundle.gestures),
+            1 / len(bundle.gestures),
+            # Windows that overlap do not count as independent answers.
+            score_interval(scores.get("accuracy"), trials),
             rest=_rest(scores.get("nobody"), split == WHOLE_PEOPLE),
+            settings="" if bundle.personal else _settings(*used),
+            bundle=path,
         )
     ]
+
+
+def _proven(row: ResultRow, proof: ResultRow | None) -> ResultRow:
+    """Return the result of a network, with the score of the evaluation of its settings if there is one."""
+    if proof is None or proof.apart[1:] != row.apart[1 : 1 + row.classes]:
+        return row
+    return replace(proof, id=row.id, kind=TRAINING, path=row.path, when_s=row.when_s, bundle=row.path)
 
 
 def _rest(nobody: Mapping[str, Any] | None, apart: bool) -> float | None:
@@ -386,6 +463,7 @@ class ResultDetails:
     clickable: bool = False
     later: bool = False
     pooled: float | None = None
+    report: Path | None = None
     facts: dict[str, Any] = field(default_factory=dict)
 
 
@@ -402,13 +480,19 @@ class MisreadRecording(NamedTuple):
 
 @dataclass(frozen=True)
 class DatasetCounts:
-    """Counts of a data set, without excluded recordings."""
+    """Counts of a data set, without excluded recordings; ``once`` are the gestures with a single recording."""
 
     people: int
     recordings: int
     gestures: tuple[str, ...]
+    once: tuple[str, ...]
     streams: int
     simulated: bool
+
+
+def recommended(networks: Mapping[Path, ResultRow]) -> str:
+    """Return the path of the newest of `StoredResults.networks` that may be recommended, or ""."""
+    return next((str(path) for path, row in networks.items() if row.usable), "")
 
 
 class StoredResults:
@@ -419,8 +503,32 @@ class StoredResults:
         self._read: dict[tuple[str, Path], tuple[Any, Any]] = {}
 
     def rows(self) -> list[ResultRow]:
-        """Return all readable results, newest first."""
-        return sorted(self._rows(), key=lambda row: -row.when_s)
+        """Return all readable results, newest first; a network has the score of its best evaluation, if it has any."""
+        rows = sorted(self._rows(), key=lambda row: -row.when_s)
+        proofs: dict[str, ResultRow] = {}
+        for row in sorted(rows, key=lambda row: (row.apart_people, row.split.startswith("leave-one"), row.when_s)):
+            if row.kind == EVALUATION and not row.leaky:
+                proofs[row.settings] = row
+        bundles = {row.settings: row.path for row in reversed(rows) if row.kind == TRAINING}
+        return [
+            _proven(row, proofs.get(row.settings))
+            if row.kind == TRAINING
+            else replace(row, bundle=bundles.get(row.settings) if row.settings else None)
+            for row in rows
+        ]
+
+    def comparable(self, row: ResultRow) -> list[ResultRow]:
+        """Return the other evaluations that can be compared with that of ``row`` person by person."""
+        return [
+            other
+            for other in self.rows()
+            if other.kind == EVALUATION and other.proof != row.proof and other.paired and row.paired
+            if (other.apart, other.context.split()[-1]) == (row.apart, row.context.split()[-1])
+        ]
+
+    def networks(self) -> dict[Path, ResultRow]:
+        """Return the result of each readable bundle, the newest first."""
+        return {row.path: row for row in self.rows() if row.kind == TRAINING}
 
     def _rows(self) -> Iterator[ResultRow]:
         for dataset in self._workspace.datasets():
@@ -441,7 +549,7 @@ class StoredResults:
 
     def find(self, identity: str) -> ResultRow | None:
         """Return the result with this id, or None."""
-        return next((row for row in self._rows() if row.id == identity), None)
+        return next((row for row in self.rows() if row.id == identity), None)
 
     def details(self, row: ResultRow) -> ResultDetails:
         """Read the details of a result; raise PlushSenseError if its files cannot be read."""
@@ -451,8 +559,12 @@ class StoredResults:
             raise _unreadable(row.path / SCORES) from None
 
     def _details(self, row: ResultRow) -> ResultDetails:
-        if row.kind == EVALUATION:
-            table = read_json(self._inside(row.path / SCORES))
+        facts: dict[str, Any] = {}
+        if row.kind == TRAINING:
+            bundle = Bundle.load(row.path)
+            facts = {**bundle.provenance, "fitted": bundle.decision.get("fitted")}
+        if row.proof is not None:
+            table = read_json(self._inside(row.proof / SCORES))
             affects = _affects((one["label"], one["affect"]) for one in table["per_class"])
             by_affect = _confusion(table["confusion_affect"])
             _affects((label, label) for label in by_affect.labels)
@@ -462,8 +574,9 @@ class StoredResults:
                 by_affect,
                 affects,
                 tuple(map(_scores_of_person, table["subjects"])),
-                (row.path / PREDICTIONS).is_file(),
-                facts={"code_version": table["code_version"], "hash": table["dataset"]["hash"]},
+                (row.proof / PREDICTIONS).is_file(),
+                facts=facts or {"code_version": table["code_version"], "hash": table["dataset"]["hash"]},
+                report=report if (report := self._inside(row.proof / PAGE)).is_file() else None,
                 pooled=replace(row, accuracy=table["pooled"]["accuracy"]).accuracy,
             )
         if row.kind == TRIAL:
@@ -476,9 +589,7 @@ class StoredResults:
             stored = prediction_files(table).get(row.trial, "")
             clickable = bool(stored) and (row.path / stored).is_file()
             return ResultDetails(row, by_gesture, sum_by_affect(by_gesture, affects), affects, clickable=clickable)
-        bundle = Bundle.load(row.path)
         affects = {g.label: g.affect for g in bundle.gestures.gestures}
-        facts = {**bundle.provenance, "fitted": bundle.decision.get("fitted")}
         later = bool(row.dataset) and row.spread == HELD_BACK
         return ResultDetails(row, affects=affects, facts=facts, later=later)
 
@@ -495,7 +606,7 @@ class StoredResults:
         return replace(details, by_gesture=by_gesture, by_affect=by_affect, clickable=True, later=False)
 
     def _predictions(self, row: ResultRow) -> Predictions:
-        if row.kind == TRAINING:
+        if row.kind == TRAINING and row.proof is None:
             dataset = Path(row.dataset)
             key, stamp = ("validation", row.path), file_stamps(row.path, dataset / HEAD, dataset / "recordings.csv")
             cached = self._read.get(key)
@@ -506,8 +617,8 @@ class StoredResults:
             predictions: Predictions = cached[1]
             return predictions
         files = prediction_files(read_json(self._inside(row.path / SWEEP))) if row.kind == TRIAL else {}
-        file = self._inside(row.path / files.get(row.trial, PREDICTIONS))
-        stored = self._once(file, lambda path, _: read_predictions(path), None, refuse=True)
+        file = self._inside((row.proof or row.path) / files.get(row.trial, PREDICTIONS))
+        stored = self._once(file, _read_apart, None, refuse=True)
         assert stored is not None
         return stored
 
@@ -530,9 +641,10 @@ class StoredResults:
         if self._read.get(key, (None,))[0] != file_stamps(*files):
             data = open_dataset(dataset)
             people = {r.subject for r in data.used} & set(data.subjects)
-            used = {r.gesture for r in data.used}
+            used = Counter(r.gesture for r in data.used)
             labels = tuple(label for label in data.gestures.labels if label in used)
-            counts = DatasetCounts(len(people), len(data.used), labels, len(data.streams), data.head.simulated)
+            once = tuple(label for label in labels if used[label] == 1)
+            counts = DatasetCounts(len(people), len(data.used), labels, once, len(data.streams), data.head.simulated)
             # Read the time stamps now, because opening the data set may have rewritten the index.
             self._read[key] = (file_stamps(*files), counts)
         found: DatasetCounts = self._read[key][1]
@@ -560,6 +672,12 @@ class StoredResults:
             self._read[key] = cached
         result: T | None = cached[1]
         return result
+
+
+def _read_apart(path: Path, _: None) -> Predictions:
+    """Read stored predictions in a process of its own, because the reader of Parquet takes 45 MB until its end."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(read_predictions, path).result()
 
 
 def recordings_of_cell(
