@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from plushsense.dataset.backup import check_backup
+from plushsense.dataset.publishing.description import CHECKSUMS
 from plushsense.studio.app.workspace import Workspace
 from support.browsing import LONG_MS, axe, connected, marked
 from support.recorded import record
@@ -94,4 +95,14 @@ def test_a_person_is_forgotten_everywhere_and_comes_back_by_no_single_click(
     assert [path for path in home.rglob("*") if "P02" in path.name] == [] == list((home / "backups").iterdir())
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert axe(page) == []
+    # A package is deleted with its zip.
+    (home / "packages" / "old").mkdir(parents=True)
+    for file in (home / "packages" / "old" / CHECKSUMS, home / "packages" / "old.zip"):
+        file.write_bytes(b"")
+    page.goto(page.url.rstrip("/") + "/publish?name=old")
+    connected(page)
+    marked(page, "delete").click()
+    marked(page, "ask-go").click()
+    marked(page, "message").get_by_text("old” ir izdzēst").wait_for()
+    assert list((home / "packages").iterdir()) == [] and not marked(page, "take").count()
     assert browser.complaints == []

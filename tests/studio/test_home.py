@@ -65,15 +65,16 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     browser = look(TABLET)
     page = browser.open(url)
     assert "Some sessions are not in a data set yet: 1" in marked(page, "next-sentence").inner_text()
-    assert marked(page, "new-name").input_value() == "recordings"
-    marked(page, "new-name").fill("autumn & co")
+    name = marked(page, "batch").locator("[data-test=new-name]")
+    assert name.input_value() == "recordings"
+    name.fill("autumn & co")
     marked(page, "make").click()
     marked(page, "sessions").get_by_role("alert").get_by_text("cannot be a name").wait_for()
     assert axe(page) == []
-    marked(page, "new-name").fill("autumn")
+    name.fill("autumn")
     marked(page, "make").click()
     marked(page, "dataset").get_by_text("recordings: 4").wait_for()
-    assert marked(page, "message").count() == 0
+    marked(page, "message").get_by_text("S01/1 → autumn").wait_for()
     marked(page, "sessions").get_by_text("in the data sets “autumn”").wait_for()
     record(workspace, "S02")
     page.reload()
@@ -82,7 +83,7 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     marked(page, "dataset").get_by_text("recordings: 8").wait_for()
     page.locator("[data-test=batch] .q-checkbox").first.wait_for()
     # Nothing is ticked any more, for all is kept.
-    marked(page, "add").click()
+    marked(page, "make").click()
     marked(page, "message").get_by_text("No session is chosen").wait_for()
     assert axe(page) == []
     assert browser.complaints == []

@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import pytest
 
@@ -109,7 +110,7 @@ def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path
     marked(page, "collect").click()
     page.wait_for_url("**/review?dataset=**")
     marked(page, "title").wait_for()
-    assert page.url.endswith("/datasets/recordings")
+    assert "/datasets/recordings&session=S01/1" in unquote(page.url)
     with (tmp_path / "home" / "datasets" / "recordings" / "recordings.csv").open() as index:
         assert len(index.readlines()) == 1 + 5, "the discarded one too, excluded"
     assert browser.complaints == []
@@ -141,7 +142,7 @@ def test_every_page_names_the_session_that_is_being_recorded(studio: Fixture, lo
     assert "Recordings of this session: 1." in marked(page, "ended-session").inner_text()
     assert axe(page) == []
     marked(page, "collect").click()
-    page.wait_for_url("**/review?dataset=**/recordings")
+    page.wait_for_url("**/review?dataset=**/recordings&session=**")
     assert browser.complaints == []
 
 

@@ -202,16 +202,13 @@ def test_a_data_set_changes_its_name_and_keeps_its_folder(tmp_path: Path) -> Non
             workspace.rename(other, name)
 
 
-def test_recordings_go_into_the_last_changed_data_set_of_their_layout(tmp_path: Path) -> None:
+def test_recordings_fit_into_data_sets_of_their_layout(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path)
-    assert workspace.dataset_for("accel-3", False) == tmp_path / "datasets" / "recordings"
-    old, new = made_dataset(workspace, "old"), made_dataset(workspace, "new")
-    made_dataset(workspace, "simulated", simulated=True)
-    os.utime(old / "recordings.csv", (1e9, 1e9))
-    assert workspace.dataset_for("accel-3", False) == new
-    os.utime(new / "recordings.csv", (1e8, 1e8))
-    assert workspace.dataset_for("accel-3", False) == old
-    assert workspace.dataset_for("plush-15", False) == tmp_path / "datasets" / "recordings"
+    assert workspace.fitting("accel-3", False) == []
+    made = [made_dataset(workspace, name) for name in ("new", "old")]
+    virtual = made_dataset(workspace, "simulated", simulated=True)
+    assert workspace.fitting("accel-3", False) == made and workspace.fitting("accel-3", True) == [virtual]
+    assert workspace.fitting("plush-15", False) == []
 
 
 def test_many_rings_are_heard_as_one_and_none_after_the_end() -> None:

@@ -515,4 +515,5 @@ def import_simulation(
         licence="MIT",
         consent="nobody: a simulation",
         progress=lambda at, total: progress("importing", at, total),
+        readmit=True,  # Nobody is behind the codes of virtual people.
     ).dataset

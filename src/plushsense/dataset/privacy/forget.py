@@ -1,9 +1,10 @@
 """Remove a person from a data set: raw and session files, marks, the people's table, caches, evaluations.
 
-This is the only operation that rewrites append-only files. The intent is written first (``forgetting.json``), so that
-the same call finishes an interrupted run. In the data set only a line in ``forgotten.jsonl`` remains, with the day and
-the number of files but not the person; the home that it lies in remembers the code (`dataset.privacy.removed`).
-Programs that use the data set at the same time can no longer write results (`dataset.store.Generation`).
+Removing a person, and taking a session out again, are the only operations that rewrite append-only files. The intent of
+a removal is written first (``forgetting.json``), so that the same call finishes an interrupted run. In the data set
+only a line in ``forgotten.jsonl`` remains, with the day and the number of files but not the person; the home that it
+lies in remembers the code (`dataset.privacy.removed`). Programs that use the data set at the same time can no longer
+write results (`dataset.store.Generation`).
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from plushsense.dataset.files import (
     list_files,
     match_code,
     person_folders,
+    walk_files,
 )
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, adding_locked, locked
@@ -343,6 +345,47 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
     with contextlib.suppress(DatasetError):
         open_dataset(folder)
     return plan
+
+
+def take_out(dataset: str | Path, session: Path) -> None:
+    """Take a recorded session out of a data set again: its copies, the marks on them, and the line of its person.
+
+    The folder of the session, ``<person>/<session>``, stays as it is, and can be imported again.
+
+    Raises:
+        DatasetError: if the data set does not hold the session, or other files under its name, or files are in use.
+    """
+    folder, name = Path(dataset), f"{session.parent.name}/{session.name}"
+    places = [folder / kind / name for kind in (RECORDINGS, STREAMS)]
+    try:
+        with adding_locked(folder), locked(folder):
+            copies = [path for place in places for path in walk_files(place) if path.suffix == ".csv"]
+            if not copies or not all(_begins(session / path.name, path) for path in copies):
+                raise DatasetError(
+                    "“{dataset}” does not hold the session {name} as it was recorded, so nothing was taken out.",
+                    dataset=folder.name,
+                    name=name,
+                )
+            # The index first, which would say that files are lost.
+            for path in (*(folder / name for name in reversed(INDEX)), *places, folder / CACHE):
+                _remove(path)
+            for place in places:
+                with contextlib.suppress(OSError):  # not empty: the person has other sessions there
+                    place.parent.rmdir()
+            _rewrite_marks(folder, name)
+            people = read_people(folder)
+            if session.parent.name not in person_folders(folder):
+                people.pop(_row_of(session.parent.name, people), None)
+                write_people(folder, people.values())
+    except Timeout:
+        raise DatasetError("Another import is adding to '{dest}' now: wait until it ends.", dest=folder) from None
+    with contextlib.suppress(DatasetError):
+        open_dataset(folder)
+
+
+def _begins(session_file: Path, copy: Path) -> bool:
+    """Return whether a file of a session begins as its copy, to which the recorder may have added since."""
+    return session_file.is_file() and session_file.read_bytes().startswith(copy.read_bytes())
 
 
 def _begin(folder: Path, plan: RemovalPlan) -> _Intent:

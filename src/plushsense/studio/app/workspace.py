@@ -28,7 +28,7 @@ WORK, DISCARDED, BACKUPS = "work", "discarded", "backups"
 PROTOCOLS = "protocols"
 """Folder of the user's own recording protocols."""
 VIRTUAL = "virtual://?person=7"
-_HEAD, _INDEX = "dataset.toml", "recordings.csv"
+_HEAD = "dataset.toml"
 _BUNDLE = "*.plush"
 _COPY = "~~"  # before the number of a second discarded file of the same name
 _NOT_PLAIN = re.compile(r"[^\w .-]")
@@ -262,24 +262,19 @@ class Workspace:
             )
         return plain
 
-    def dataset_for(self, layout: str, simulated: bool, name: str = RECORDINGS) -> Path:
-        """Return the folder of the data set to which recordings can be added, the last changed one of several.
+    def fitting(self, layout: str, simulated: bool) -> list[Path]:
+        """Return the data sets to which recordings of a layout can be added.
 
         Args:
-            layout: name of the layout of the recordings.
             simulated: whether the toy was a virtual one; real and simulated recordings are never mixed.
-            name: the name of a new data set.
-
-        Returns:
-            The path of a new data set if none fits.
         """
         fitting = []
         for path in self.datasets():
             with contextlib.suppress(PlushSenseError, OSError):
                 head = DatasetHead.read(path)
                 if (head.layout.name, head.simulated) == (layout, simulated):
-                    fitting.append(((path / _INDEX).stat().st_mtime, path))
-        return max(fitting)[1] if fitting else self.folder / DATASETS / self.free_name(DATASETS, name)
+                    fitting.append(path)
+        return fitting
 
     def free_name(self, kind: str, name: str, *suffixes: str, separator: str = "-", taken: Collection[str] = ()) -> str:
         """Return ``name``, numbered if it is in ``taken`` or exists in ``folder / kind`` with one of ``suffixes``."""

@@ -56,6 +56,7 @@ class ForgetDialog:
         self._page, self._words, self._jobs, self._workspace = page, page.words, jobs, page.workspace
         home = self._workspace.folder
         self._given = [path for path in self._workspace.given if home not in path.parents]
+        self._person = ""
         self._ticks: list[tuple[PersonTrace, ui.checkbox]] = []
 
     async def open(self) -> None:
@@ -74,6 +75,7 @@ class ForgetDialog:
 
     async def _look(self, person: str) -> None:
         """Show everything that names the person or has read their recordings."""
+        self._person = person
         self._box.clear()
         with self._box:
             ui.spinner(size="1.2em").props("aria-hidden=true")
@@ -82,6 +84,7 @@ class ForgetDialog:
             found = await run.io_bound(find_traces, self._workspace.folder, person, self._given)
         if found is None:
             self._dialog.close()
+        if found is None or person != self._person:
             return
         self._box.clear()
         with self._box:

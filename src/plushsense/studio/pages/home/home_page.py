@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
 
 from markupsafe import Markup
 from nicegui import context, run, ui
@@ -15,17 +17,19 @@ from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import DATASETS, VIRTUAL, WORK
 from plushsense.studio.pages.home.datasets import DatasetSection
 from plushsense.studio.pages.home.incoming import IncomingSection
-from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
+from plushsense.studio.pages.home.overview import NextStep, Overview, SessionEntry, WorkspaceSummary, next_step
 from plushsense.studio.pages.home.sections import (
     DiscardedSection,
     FileActions,
     JobList,
     SessionSection,
     page_links,
+    put_away,
     simulation_badge,
     titled_card,
 )
 from plushsense.studio.pages.home.toy import ToySection
+from plushsense.studio.widgets.destination import Destination
 from plushsense.studio.widgets.elements import style
 from plushsense.studio.widgets.verdict import show_verdict
 
@@ -139,12 +143,12 @@ async def show(page: Page) -> None:
     overview, jobs, toys = workspace.part(Overview), workspace.part(Jobs), workspace.part(Toys)
     style()
     summary = await run.io_bound(overview.look)
-    step = NextStepCard(page, jobs, toys)
+    step = NextStepCard(page, jobs, toys, lambda: refresh())
     with ui.element("div").classes("ps-two w-full"):
         with ui.column().classes("w-full"):
             actions = FileActions(page, jobs, lambda: refresh())
             datasets = DatasetSection(page, jobs, actions)
-            sessions = SessionSection(page, jobs)
+            sessions = SessionSection(page, lambda: refresh())
             networks = bundles(page, actions)
             IncomingSection(page, jobs, lambda: refresh())
             discarded = DiscardedSection(page, actions)
@@ -184,8 +188,8 @@ async def show(page: Page) -> None:
 class NextStepCard:
     """Card with the suggested next step and its button."""
 
-    def __init__(self, page: Page, jobs: Jobs, toys: Toys) -> None:
-        self._page, self._jobs, self._toys = page, jobs, toys
+    def __init__(self, page: Page, jobs: Jobs, toys: Toys, refresh: Callable[[], Awaitable[None]]) -> None:
+        self._page, self._jobs, self._toys, self._refresh = page, jobs, toys, refresh
         self._summary = WorkspaceSummary()
         self._step: NextStep | None = None
         self._box = tag(ui.card().classes("ps-card ps-next w-full").props("flat"), "next")
@@ -208,16 +212,19 @@ class NextStepCard:
             html(words("Next step"), "h2")
             with ui.row().classes("items-center w-full"):
                 tag(ui.label(words(_NEXT[step.key], **step.values)), "next-sentence").classes("text-lg")
+                call: Callable[[], Any] = lambda: self._do(step)  # noqa: E731
+                if step.key == "collect":
+                    waiting = self._waiting()
+                    destination = Destination(self._page, waiting[0].layout, waiting[0].simulated)
+                    call = partial(put_away, self._page, destination, [s.path for s in waiting], self._refresh)
                 if text := _NEXT_BUTTONS.get(step.key):
-                    button("next-button", words(text), lambda: self._do(step), "unelevated size=lg color=primary")
+                    button("next-button", words(text), call, "unelevated size=lg color=primary")
                 if second := {"try": "record", "live": "export"}.get(step.key):
                     button("", words(_NEXT_BUTTONS[second]), lambda: self._go(second, step))
 
     def _do(self, step: NextStep) -> None:
         if step.key == "try":
             self._try()
-        elif step.key == "collect":
-            self._collect()
         elif step.key == "making":
             self._page.show_work()
         else:
@@ -227,16 +234,10 @@ class NextStepCard:
     def _go(page: str, step: NextStep) -> None:
         ui.navigate.to(address(page, model=step.values.get("model", "")))
 
-    def _collect(self) -> None:
-        """Import the sessions that are in no data set; add them to one that fits, if there is one."""
-        workspace = self._page.workspace
-        batch = next(b for b in self._summary.batches() if any(s.waiting for s in b))
-        with self._page.show_errors():
-            name = self._page.words("recordings")
-            place = workspace.dataset_for(batch[0].layout, batch[0].simulated, name)
-            title = self._page.words("Import into the data set “{name}”", name=workspace.title(place))
-            self._jobs.import_sessions([s.path for s in batch if s.waiting], place, title)
-            self._page.show_work()
+    def _waiting(self) -> list[SessionEntry]:
+        """Return the sessions that are in no data set and can go into one together."""
+        batches = ([s for s in batch if s.waiting] for batch in self._summary.batches())
+        return next(batch for batch in batches if batch)
 
     def _try(self) -> None:
         """Start to simulate a small data set, and choose the virtual toy if no toy is chosen."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,15 @@ from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, page_texts, tag
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import BACKUPS, DATASETS, DISCARDED
+from plushsense.studio.app.workspace import BACKUPS, DISCARDED
 from plushsense.studio.pages.home.forgetting import receipt_text
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
+from plushsense.studio.widgets.destination import Destination, moved, session_name, take_back
 from plushsense.studio.widgets.elements import (
     JOB_STATES,
     admitting,
     ask,
     change_files,
-    errors_beside,
     folded_lines,
     item_menu,
     summary,
@@ -168,11 +169,28 @@ def findings_text(page: Page, result: dict[str, Any]) -> str:
     )
 
 
-class SessionSection:
-    """Section that lists the recorded sessions and imports them into data sets."""
+async def put_away(
+    page: Page, destination: Destination, sessions: list[Path], refresh: Callable[[], Awaitable[None]]
+) -> None:
+    """Put sessions into the chosen data set; then say where they are, with a button to take them out again."""
+    names = list(map(session_name, sessions))
 
-    def __init__(self, page: Page, jobs: Jobs) -> None:
-        self._page, self._jobs = page, jobs
+    async def undone() -> None:
+        await refresh()
+        page.say(page.words("Undone."), "good")
+
+    def done(place: Path) -> None:
+        text = moved(names, page.workspace.title(place))
+        page.say(text, "good", lambda: take_back(page, place, names, undone))
+
+    await destination.put(sessions, done)
+
+
+class SessionSection:
+    """Section that lists the recorded sessions and imports them into data sets; ``refresh`` shows all files again."""
+
+    def __init__(self, page: Page, refresh: Callable[[], Awaitable[None]]) -> None:
+        self._page, self._refresh = page, refresh
         self._chosen: set[str] = set()
         self._displayed: tuple[object, ...] = ()
         self._box = titled_card(page, "Recorded sessions", "sessions")
@@ -208,17 +226,8 @@ class SessionSection:
                     box = ui.checkbox(self._describe(entry), value=str(entry.path) in self._chosen)
                     box.on_value_change(lambda e, entry=entry: self._choose(entry, bool(e.value)))
                     box.set_enabled(not entry.active)
-            with ui.row().classes("items-start ps-small-gap w-full"):
-                free = page.workspace.free_name(DATASETS, words("recordings"))
-                name = tag(ui.input(words("Name of the new data set"), value=free).classes("ps-wide"), "new-name")
-                button("make", words("Make a data set from these"), lambda: self._make(batch, name), "unelevated")
-            first = batch[0]
-            fitting = [d for d in datasets if (d.simulated, d.layout) == (first.simulated, first.layout)]
-            if fitting:
-                with ui.row().classes("items-end ps-small-gap w-full"):
-                    names = {str(d.path): d.name for d in fitting}
-                    to = ui.select(names, value=next(iter(names)), label=words("Existing data set")).classes("ps-wide")
-                    button("add", words("Add new recordings"), lambda: self._add(batch, str(to.value)))
+            destination = Destination(page, batch[0].layout, batch[0].simulated, words("Recorded sessions"))
+            button("make", words("Put them into a data set"), partial(self._put, batch, destination), "unelevated")
 
     def _describe(self, entry: SessionEntry) -> str:
         words = self._page.words
@@ -240,29 +249,12 @@ class SessionSection:
     def _choose(self, entry: SessionEntry, chosen: bool) -> None:
         (self._chosen.add if chosen else self._chosen.discard)(str(entry.path))
 
-    async def _make(self, batch: tuple[SessionEntry, ...], name: ui.input) -> None:
-        with errors_beside(self._page, name):
-            place = self._page.workspace.new(DATASETS, str(name.value or ""))
-            await self._start(batch, place, place.name)
-
-    async def _add(self, batch: tuple[SessionEntry, ...], dataset: str) -> None:
-        with self._page.show_errors():
-            place = self._page.workspace.inside(dataset)
-            await self._start(batch, place, self._page.workspace.title(place))
-
-    async def _start(self, batch: tuple[SessionEntry, ...], place: Path, name: str) -> None:
+    async def _put(self, batch: tuple[SessionEntry, ...], destination: Destination) -> None:
         chosen = [s.path for s in batch if str(s.path) in self._chosen]
         if not chosen:
             self._page.say(self._page.words("No session is chosen. Tick at least one."), "warning")
             return
-        self._page.say("")
-        title = self._page.words("Import into the data set “{name}”", name=name)
-
-        def start(readmit: bool) -> None:
-            self._jobs.import_sessions(chosen, place, title, readmit)
-            self._page.show_work()
-
-        await admitting(self._page, start)
+        await put_away(self._page, destination, chosen, self._refresh)
 
 
 class JobList:
@@ -315,7 +307,9 @@ class JobList:
             self._result(job)
         with ui.row().classes("items-center ps-small-gap"):
             if job.state == DONE and job.task in PAGE_OF:
-                page_links(self._page, (PAGE_OF[job.task],), title, dataset=job.result.get("dataset") or "")
+                sessions = ",".join(session_name(Path(each)) for each in job.spec.get("sessions", ()))
+                place = job.result.get("dataset") or ""
+                page_links(self._page, (PAGE_OF[job.task],), title, dataset=place, session=sessions)
             if job.state == RUNNING:
                 self._button("stop", words("Stop"), title, lambda: self._jobs.stop(job.id))
                 return

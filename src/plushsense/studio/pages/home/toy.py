@@ -133,7 +133,7 @@ class ToySection:
         assert result is not None
         values: dict[str, Any] = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
         key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
-        values |= {"frames": result.frames, "layout": result.layout, "malformed": result.malformed}
+        values |= {"frames": str(result.frames), "layout": result.layout, "malformed": str(result.malformed)}
         return ("good" if key == "good" else "warning"), words(_TESTS[key], **values)
 
     def _show_others(self) -> None:

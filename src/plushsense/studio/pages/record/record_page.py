@@ -20,7 +20,7 @@ from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import show_child
 from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
-from plushsense.studio.pages.record.session_page import collect, show_session
+from plushsense.studio.pages.record.session_page import collect, destination_of, show_session
 from plushsense.studio.widgets.elements import ask, change_files, item_menu, open_dialog, summary
 
 _WORDINGS: Texts = {
@@ -70,7 +70,7 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
             steps=session.steps,
         )
         page.say(text, "good")
-        if session.done:
+        if session.done and session.head is not None:
             _ended(page, session)
     elif requested in mine and not mine[requested].finished:
         page.say(page.words("{name} is not open now. Continue it below.", name=requested), "warning")
@@ -86,11 +86,13 @@ def _ended(page: Page, session: SessionSummary) -> None:
     async def clicked() -> None:
         see.disable()
         with page.show_errors():
-            see.set_enabled(not await collect(page, session.folder))
+            see.set_enabled(not await collect(page, session.folder, destination))
 
     with tag(ui.row().classes("ps-card ps-next w-full items-center"), "ended-session"):
         text = page.words("Recordings of this session: {n}. They are put into a data set.", n=session.done)
         ui.label(text).classes("flex-grow text-lg")
+        assert session.head is not None
+        destination = destination_of(page, session.head)
         see = button("collect", page.words("Look at the recordings"), clicked, "unelevated size=lg", about=session.name)
 
 

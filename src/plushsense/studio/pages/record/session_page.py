@@ -11,10 +11,9 @@ from nicegui import run, ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from plushsense.core.errors import DatasetError, PlushSenseError
+from plushsense.core.errors import PlushSenseError
 from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import SessionHead
-from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import CHILD, Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.toys import ToyInUseError
 from plushsense.studio.app.words import Texts, Words
@@ -23,7 +22,7 @@ from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.last_recording import ResultPanel
 from plushsense.studio.pages.record.panels import SignalPanel, StepList
-from plushsense.studio.widgets.elements import admitting
+from plushsense.studio.widgets.destination import Destination, review_address
 
 _STATES: Texts = {
     "countdown": "GET READY",
@@ -53,33 +52,14 @@ _NOTICES: Texts = {
 }
 
 
-async def collect(page: Page, folder: Path) -> bool:
-    """Import an ended session into a data set that fits, or into a new one; then show its recordings for review.
+def destination_of(page: Page, head: SessionHead) -> Destination:
+    """Add the choice of the data set that the recordings of a session go into."""
+    return Destination(page, str(head.layout["name"]), head.simulated)
 
-    Returns:
-        Whether the import has begun; otherwise it was refused, or asks whether to take the person in.
-    """
-    jobs, words = page.workspace.part(Jobs), page.words
-    head = SessionHead.read(folder)
-    if head is None:
-        raise DatasetError("The folder {name} holds no session.", name=folder.name)
-    place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated, words("recordings"))
-    name = page.workspace.title(place)
 
-    def begin(readmit: bool) -> None:
-        job = jobs.import_sessions([folder], place, words("Import into the data set “{name}”", name=name), readmit)
-        page.say(words("The recordings go into the data set “{name}” …", name=name))
-
-        def follow() -> None:
-            if job.state == DONE:
-                ui.navigate.to(address("review", dataset=place))
-            elif job.state != RUNNING:
-                stopped = words("The recordings were not put into a data set: try it again on the home page.")
-                page.say(words.failure(job.refusal) or stopped, "error")
-
-        on_change(jobs.changed, follow)
-
-    return await admitting(page, begin)
+async def collect(page: Page, folder: Path, destination: Destination) -> bool:
+    """Import an ended session, and then show its recordings for review; return whether the import has begun."""
+    return await destination.put([folder], lambda place: ui.navigate.to(review_address(place, [folder])))
 
 
 _DRAW_S = 0.1
@@ -264,6 +244,7 @@ class _View:
         with self._done:
             self._done_text = ui.label().classes("text-bold").style("overflow-wrap: anywhere")
             ui.label(words("Next: look at the recordings. This ends the session and puts them into a data set."))
+            self._destination = destination_of(self._page, self._session.head)
             with ui.row().classes("items-center"):
                 button("collect", words("Look at the recordings"), self._collect, "unelevated")
                 ui.link(words("Go to the home page"), "/").classes("ps-link")
@@ -355,7 +336,7 @@ class _View:
 
     async def _collect(self) -> None:
         """End the session, and lead to its recordings."""
-        await self._end(partial(collect, self._page, self._session.recorder.session.folder))
+        await self._end(partial(collect, self._page, self._session.recorder.session.folder, self._destination))
 
     async def _reopen(self) -> None:
         """Resume the session; if that fails, let the button lead to the start page to choose another toy."""

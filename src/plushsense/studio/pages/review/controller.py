@@ -208,7 +208,8 @@ class ReviewController:
         self.ends = False
         self.only: dict[str, None] | None = None
         self.title = ""
-        self._query = {k: v for k, v in query.items() if k in ("dataset", "selection")}
+        self.take_back: Callable[[], Any] | None = None
+        self._query = {k: v for k, v in query.items() if k in ("dataset", "selection", "session")}
         self._turn = asyncio.Lock()
         self._rows: object = None
         self._address = ""
@@ -218,12 +219,17 @@ class ReviewController:
         if not only:
             return
         self.only, self.title = {i: None for i in only if i in self.review.infos}, title
-        if not self._query.get("selection"):
+        if not self._is_named:
             self._query |= {"title": title}
         if missing := [i for i in only if i not in self.only]:
             values = {"n": len(missing), "first": missing[0]}
             text = self.words("Linked recordings that are not in this data set: {n}, for example “{first}”.", **values)
             self.page.say(text, "warning")
+
+    @property
+    def _is_named(self) -> bool:
+        """Whether the address names the recordings by a selection or session, and need not list them."""
+        return bool(self._query.get("selection") or self._query.get("session"))
 
     # Building -----------------------------------------------------------------------------------------------------
 
@@ -265,6 +271,8 @@ class ReviewController:
             with tag(ui.row().classes("w-full items-center ps-message ps-message-info"), "selection"):
                 text = words("Only the linked recordings ({n}). {title}", n=len(self.only), title=self.title)
                 ui.label(text).classes("flex-grow")
+                if self.take_back is not None:
+                    button("take-back", words("Undo"), self.take_back, "outline color=inherit", about=self.title)
                 ui.link(words("Show all"), address("review", dataset=review.path)).style("color: inherit")
         self.views = {name: view(self) for name, view in views.items()}
         on_change(review.changed, self.changed)
@@ -573,7 +581,7 @@ class ReviewController:
         if self.view == STREAM:
             query["stream"] = self.stream
         pairs = list(query.items())
-        if self.only is not None and not query.get("selection"):
+        if self.only is not None and not self._is_named:
             pairs += [("recordings", i) for i in self.only]
         path = f"/review?{urlencode(pairs)}"
         if path != self._address:

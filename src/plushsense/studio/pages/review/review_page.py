@@ -6,6 +6,8 @@ The query parameters of the address contain the state of the page, for links and
     a data set in the folders of the studio, as an absolute path or relative to the home folder; by default the first.
 ``recordings=ID`` (several times), ``title=TEXT``
     show only these recordings, under this title. Unknown ids are left out and reported.
+``session=NAME``
+    show only the recordings of these sessions (``S01/1,S02/1``), which were just put there, with a button to undo that.
 ``selection=KEY``
     the same, but stored under a key. `plushsense.studio.app.selections.Selections.address` chooses one of these.
 ``person, gesture, state, severity, check, text``
@@ -30,6 +32,7 @@ from plushsense.studio.pages.review.recording_view import RecordingView
 from plushsense.studio.pages.review.review import Review, Reviews
 from plushsense.studio.pages.review.stream_view import StreamView
 from plushsense.studio.pages.review.table_view import RecordingTableView
+from plushsense.studio.widgets.destination import moved, take_back
 
 _CSS = Path(__file__).with_name("review.css")
 
@@ -66,6 +69,11 @@ async def show(page: Page) -> None:
                 return
             title, recordings = selection
         controller = ReviewController(page, review, values)
+        if sessions := values.get("session", "").split(",") if values.get("session") else []:
+            title = moved(sessions, review.dataset.head.name)
+            recordings = [i for i in review.infos if i.startswith(tuple(f"{name}/" for name in sessions))]
+            back = address("record", ended=sessions[0]) if len(sessions) == 1 else address("home")
+            controller.take_back = lambda: take_back(page, review.path, sessions, lambda: ui.navigate.to(back))
         controller.limit(title, recordings)
         controller.build(
             {
