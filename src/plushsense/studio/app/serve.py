@@ -99,7 +99,6 @@ def run(
 
 def _listen(host: str, port: int, show: bool) -> None:
     """Run the web server until it is interrupted."""
-    from fastapi.middleware.gzip import GZipMiddleware
     from nicegui import ui
 
     limits = ConnectionLimits.of_process()
@@ -118,8 +117,6 @@ def _listen(host: str, port: int, show: bool) -> None:
         timeout_keep_alive=limits.keep_alive_s,
         backlog=limits.backlog,
         h11_max_incomplete_event_size=HEAD_BYTES,
-        # Compressing costs more time than it saves where nothing leaves the computer.
-        gzip_middleware_factory=None if is_loopback(host) else GZipMiddleware,
     )
 
 
