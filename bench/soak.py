@@ -119,7 +119,7 @@ def record(work: Path, hours: float, model: Path) -> dict[str, Any]:
     """Record the toy as one session; compare its stream with the frames, and its recordings with the stream."""
     layout, folder, memory = load_layout("plush-15"), work / "recorded" / "S01" / "1", MemoryLog(hours)
     gestures = ("Back stroke 1", "Hold strong", "Tail hit 1")
-    save_protocol(work / "day.toml", "day", gestures, 1000, "round")
+    save_protocol(work / "day.toml", gestures, 1000, "round")
     with open_device(toy_url(hours)) as toy:
         request = SessionRequest(toy.url, subject="S01", protocol=str(work / "day.toml"), speed=0.0)
         head = session_head(request, folder, True, layout, "soak")
