@@ -130,8 +130,8 @@ def guess_pattern(
         return _guess(source, base, found, given)
 
 
-def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> GuessedPattern:
-    """Guess the pattern of the files ``found`` below ``base``."""
+def _tables(source: Path, found: Iterable[Path], given: GuessSpec) -> tuple[list[Path], list[Path], int, str]:
+    """Return the tables with the ending of most bytes, all files with it, the number of others, and the ending."""
     files = [f for f in split_regular_files(found)[0] if not f.name.startswith(".") and _is_text(f)]
     if not files:
         raise DatasetError(
@@ -149,13 +149,25 @@ def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> Gue
             source=source,
             ending=ending,
         )
-    some = mine[:: max(1, len(mine) // _FILES)][:_FILES]
+    some = _sample(mine)
     if not given.recorded and sum(_is_recorded(f) for f in some) > 0.8 * len(some):
         raise DatasetError(
             "'{source}' holds recordings of the GestureRecorder: import it without a pattern.", source=source
         )
+    return mine, of_ending, len(files) - len(of_ending), ending
+
+
+def _sample(files: list[Path]) -> list[Path]:
+    """Return files in equal steps through all of them, at most `_FILES`."""
+    return files[:: max(1, len(files) // _FILES)][:_FILES]
+
+
+def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> GuessedPattern:
+    """Guess the pattern of the files ``found`` below ``base``."""
+    mine, of_ending, others, ending = _tables(source, found, given)
+    some = _sample(mine)
     guess = PatternDraft(given=given)
-    if others := len(files) - len(of_ending):
+    if others:
         guess.doubt("files that do not end in '{ending}' are left out: {n}", "files", ending=ending, n=others)
     guess.is_json = ENDINGS.get(ending) == "json" or _text(some[0], None, _HEAD).lstrip()[:1] in ("{", "[")
     if guess.is_json:

@@ -150,14 +150,19 @@ def guess_paths(
     found = Counter(row[roles.index("label")] for row in rows) if "label" in roles else Counter[str]()
     pattern = (folders + name if len(rows) > 1 or fixed.parts else "*") + ending
     pieces = [(key, role, [row[k] for row in rows]) for k, (key, role) in enumerate(zip(keys, roles, strict=True))]
-    candidates = [
+    candidates = _candidates([*pieces, *((key, "", texts) for key, texts in whole)], depth)
+    return PathParts([pattern], found, set(roles) & set(PARTS), doubts, candidates)
+
+
+def _candidates(pieces: Iterable[tuple[str, str, list[str]]], depth: int) -> list[Candidate]:
+    """Return what may be chosen of the pieces of paths: key, role and the texts of all paths."""
+    return [
         Candidate.of(
             f"{PATH}:{key}", role if role in PARTS else "", texts, in_folder=int(key.split(".")[0]) < depth - 1
         )
-        for key, role, texts in [*pieces, *((key, "", texts) for key, texts in whole)]
+        for key, role, texts in pieces
         if re.search(r"[^\W_]", "".join(texts))
     ]
-    return PathParts([pattern], found, set(roles) & set(PARTS), doubts, candidates)
 
 
 @dataclass(frozen=True)
