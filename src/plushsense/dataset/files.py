@@ -142,6 +142,8 @@ def accept_marks(folder: Path) -> None:
 
 CACHE = "cache"
 EVALUATIONS = "evaluations"
+DATASETS = "datasets"
+"""Folder of a home, that of a studio, with its data sets."""
 INDEX = (RECORDINGS_INDEX, STREAMS_INDEX, STAMP)
 
 # Files with a fixed name, by kind.

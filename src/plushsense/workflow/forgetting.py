@@ -22,7 +22,7 @@ from plushsense.dataset.files import CACHE, EVALUATIONS, normalize_code
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, mentions, people_of_dataset, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
-from plushsense.dataset.privacy.removed import remember_removed
+from plushsense.dataset.privacy.removed import home_of, remember_removed
 from plushsense.dataset.publishing.description import CHECKSUMS
 from plushsense.dataset.publishing.keys import open_key
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead
@@ -99,7 +99,7 @@ def forget(
     patterns = (f"recordings/{code}", f"datasets/*/recordings/{code}")
     discarded = sorted(str(p) for home in homes for pattern in patterns for p in (home / "discarded").glob(pattern))
     inside = folder.resolve()
-    studio = [inside.parent.parent] if inside.parent.name == "datasets" else []
+    studio = [home] if (home := home_of(inside)) is not None else []
     searched = dict.fromkeys(place for p in bundles if (place := Path(p).resolve()).is_dir() and place not in studio)
     listed = {Path(path).resolve() for path in (*discarded, *(b.bundle for b in trained))}
     found = find_mentions([*studio, *searched], subject, inside)
@@ -211,7 +211,7 @@ class HomeTraces:
 
 @dataclass(frozen=True)
 class RemovalReceipt:
-    """What was removed of a person, what was kept, and what could not be removed, with the reason."""
+    """Result of `forget_everywhere`: the traces removed, those kept, and those that could not be removed, with why."""
 
     found: HomeTraces
     removed: tuple[PersonTrace, ...]

@@ -16,14 +16,14 @@ from plushsense.core.errors import BundleError, DatasetError, PlushSenseError
 from plushsense.core.files import free_path, replacing_file, work_folder, write_file
 from plushsense.core.sentences import Message
 from plushsense.dataset.backup import backup, backup_people, restore
-from plushsense.dataset.files import list_package_files
+from plushsense.dataset.files import DATASETS, list_package_files
 from plushsense.dataset.importing.archives import DAMAGED, UnpackLimits, unpack, zip_entry
 from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.dataset.store import HEAD, DatasetHead, Progress
 from plushsense.models.bundle import Bundle, known_people
 
 MANIFEST = "plushsense-project.json"
-DATASETS, BUNDLES = "datasets", "bundles"
+BUNDLES = "bundles"
 VERSION = 1
 _MANIFEST_BYTES = 1 << 24
 
@@ -126,7 +126,7 @@ def open_project(
     datasets, networks = [], []
     place.mkdir(parents=True, exist_ok=True)
     with work_folder(place / "project") as work:
-        refused = [(name, Message("{why}", why=why)) for name, why in unpack(path, work / "parts", limits)]
+        refused = unpack(path, work / "parts", limits)
         members = list(_members(work / "parts"))
         for done, part in enumerate(members):
             progress(done, len(members))

@@ -127,8 +127,8 @@ def member_target(name: str) -> PurePosixPath | Message:
     return PurePosixPath(*parts)
 
 
-def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> str:
-    """Return the reason to refuse a member by its directory entry; "" if it may be unpacked."""
+def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> Message | None:
+    """Return the reason to refuse a member by its directory entry; None if it may be unpacked."""
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind == stat.S_IFLNK:
         return Message("a symbolic link is not followed")
@@ -142,7 +142,7 @@ def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> str:
             file_size=info.file_size / max(1, info.compress_size),
             ratio=limits.ratio,
         )
-    return ""
+    return None
 
 
 def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, limit: int) -> int:
@@ -168,7 +168,7 @@ def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path,
     return written
 
 
-def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list[tuple[str, str]]:
+def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list[tuple[str, Message]]:
     """Unpack the zip ``path`` into the empty ``folder``; return the refused members, each with the reason.
 
     Raises:
@@ -176,7 +176,7 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
         OSError: for errors of the disk.
     """
     limits = limits or UnpackLimits()
-    refused: list[tuple[str, str]] = []
+    refused: list[tuple[str, Message]] = []
     try:
         archive = zipfile.ZipFile(path)
     except DAMAGED as cause:
@@ -191,8 +191,10 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
         for info in members:
             name = info.filename.encode("utf-8", "backslashreplace").decode()
             target = member_target(info.orig_filename if "\x00" in info.orig_filename else info.filename)
-            reason = target if isinstance(target, str) else refusal(info, limits)
-            if isinstance(target, str) or reason:
+            if isinstance(target, Message):
+                refused.append((name, target))
+                continue
+            if (reason := refusal(info, limits)) is not None:
                 refused.append((name, reason))
                 continue
             key = unicodedata.normalize("NFC", str(target)).casefold()

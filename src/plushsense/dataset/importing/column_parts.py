@@ -45,7 +45,7 @@ _AROUND = re.compile(r"^((recordings|payload|data|sensors|values|samples)\.(?!\d
 
 @dataclass(frozen=True)
 class GuessSpec:
-    """What is known about files before a guess, which takes it as it is.
+    """Settings of a guess: what the caller states about the files, which is then not guessed.
 
     Attributes:
         parts: for ``subject``, ``session``, ``label``, ``recording`` and ``time``, the key of its `Candidate`; "" if it

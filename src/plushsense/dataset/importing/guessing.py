@@ -85,7 +85,7 @@ class GuessedPattern:
     time_unit: str = ""
     rate_hz: float = 0.0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return plain values for JSON; the doubts stay messages."""
         return vars(self) | {"candidates": [asdict(candidate) for candidate in self.candidates]}
 

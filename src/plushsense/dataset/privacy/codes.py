@@ -12,7 +12,10 @@ from plushsense.dataset.store import UNKNOWN_SUBJECT
 
 _FIRST = "S01"
 # Words before a number that are not the name of a person.
-_PLAIN = ("subj", "subject", "sub", "child", "kid", "pat", "patient", "person", "part", "test", "pilot", "user")
+_PLAIN = (
+    "subj", "subject", "sub", "child", "kid", "pat", "patient", "person", "part", "participant", "test", "pilot",
+    "user", "bērns", "berns", "dalībnieks", "dalibnieks", "cilvēks", "cilveks", "persona",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class HomeCodes:
 
     @property
     def known(self) -> frozenset[str]:
-        """All codes but the removed ones."""
+        """Return the codes of the people who are in the home now."""
         return self.others.union(self.recorded) - {NOBODY, UNKNOWN_SUBJECT}
 
     def next_free(self) -> str:

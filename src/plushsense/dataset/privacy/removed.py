@@ -18,12 +18,11 @@ from pathlib import Path
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.sentences import join_names
-from plushsense.dataset.files import normalize_code
+from plushsense.dataset.files import DATASETS, normalize_code
 
 REMOVED = "removed.json"
 CONSENT = "consent"
 """What a refusal states as ``needs`` if people would come back who were removed."""
-DATASETS = "datasets"
 _ROUNDS = 20_000
 
 

@@ -198,18 +198,26 @@ class ResultRow:
 
     @property
     def usable(self) -> bool:
-        """Whether the network may be recommended: its score is above guessing beyond its uncertainty, and not leaky."""
-        return not self.leaky and self.interval is not None and self.interval[0] > self.chance
+        """Return whether the network may be recommended.
+
+        The lower end of the 95 % interval of its accuracy is above guessing, also as pages print both: with one decimal
+        place, of ten. A leaky score is never enough.
+        """
+        return (
+            not self.leaky
+            and self.interval is not None
+            and round(10 * self.interval[0], 1) > round(10 * self.chance, 1)
+        )
 
     @property
-    def apart_people(self) -> bool:
-        """Whether nobody in the test was trained on."""
+    def subject_independent(self) -> bool:
+        """Return whether the people of the test are others than those of the training."""
         return self.split.startswith(("leave-one-subject-out", "by-subject", WHOLE_PEOPLE))
 
     @property
-    def paired(self) -> bool:
-        """Whether there are scores of several people, none of whom was trained on."""
-        return self.proof is not None and self.apart_people and len(self.people) > 1
+    def has_subject_scores(self) -> bool:
+        """Return whether an evaluation scored several people one by one, who are not those of the training."""
+        return self.proof is not None and self.subject_independent and len(self.people) > 1
 
     def __post_init__(self) -> None:
         """Raise ValueError if a value, which a file may have given, has another type or range."""
@@ -503,10 +511,16 @@ class StoredResults:
         self._read: dict[tuple[str, Path], tuple[Any, Any]] = {}
 
     def rows(self) -> list[ResultRow]:
-        """Return all readable results, newest first; a network has the score of its best evaluation, if it has any."""
+        """Return all readable results, newest first.
+
+        A network has the score of its strictest evaluation, if it has any: leave-one-subject-out before other splits by
+        people, these before splits of recordings; the newest of equal ones.
+        """
         rows = sorted(self._rows(), key=lambda row: -row.when_s)
         proofs: dict[str, ResultRow] = {}
-        for row in sorted(rows, key=lambda row: (row.apart_people, row.split.startswith("leave-one"), row.when_s)):
+        for row in sorted(
+            rows, key=lambda row: (row.subject_independent, row.split.startswith("leave-one"), row.when_s)
+        ):
             if row.kind == EVALUATION and not row.leaky:
                 proofs[row.settings] = row
         bundles = {row.settings: row.path for row in reversed(rows) if row.kind == TRAINING}
@@ -522,7 +536,10 @@ class StoredResults:
         return [
             other
             for other in self.rows()
-            if other.kind == EVALUATION and other.proof != row.proof and other.paired and row.paired
+            if other.kind == EVALUATION
+            and other.proof != row.proof
+            and other.has_subject_scores
+            and row.has_subject_scores
             if (other.apart, other.context.split()[-1]) == (row.apart, row.context.split()[-1])
         ]
 

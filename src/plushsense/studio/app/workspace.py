@@ -16,14 +16,14 @@ from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.sentences import Message
-from plushsense.dataset.files import change_head, list_package_files, person_folders, sha256_of
+from plushsense.dataset.files import DATASETS, change_head, list_package_files, person_folders, sha256_of
 from plushsense.dataset.importing.archives import DEVICE_NAME
 from plushsense.dataset.privacy.codes import HomeCodes
 from plushsense.dataset.privacy.removed import RemovedCodes
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.writer import SESSION_HEAD
 
-RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bundles", "exports", "packages"
+RECORDINGS, BUNDLES, EXPORTS, PACKAGES = "recordings", "bundles", "exports", "packages"
 WORK, DISCARDED, BACKUPS = "work", "discarded", "backups"
 PROTOCOLS = "protocols"
 """Folder of the user's own recording protocols."""

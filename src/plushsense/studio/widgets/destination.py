@@ -10,10 +10,11 @@ from typing import Any
 from nicegui import run, ui
 
 from plushsense.core.sentences import join_names
+from plushsense.dataset.files import DATASETS
 from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, named, on_change, tag
-from plushsense.studio.app.workspace import DATASETS, Workspace
+from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.widgets.elements import admitting, errors_beside
 
 _NAMED = 5

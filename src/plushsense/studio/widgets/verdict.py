@@ -68,7 +68,7 @@ def headline(w: Words, row: ResultRow) -> str:
         return w("It is adapted to one person. How well it reads others is not known.")
     if row.accuracy is None or not row.classes:
         return w("This result has no score.")
-    kind = "leaky" if row.leaky else "new" if row.apart_people else "known"
+    kind = "leaky" if row.leaky else "new" if row.subject_independent else "known"
     one = (row.units if row.spread in (SUBJECTS, HELD_BACK) else len(row.people)) == 1 and not row.leaky
     return w(_VERDICTS[f"{kind}_one" if one else kind], right=of_ten(w, row.accuracy), chance=of_ten(w, row.chance))
 
@@ -155,7 +155,7 @@ def limits(w: Words, row: ResultRow) -> list[str]:
         found.append(
             w("This is the check during training. Report the score of an evaluation, which tests every person.")
         )
-    if row.proof is not None and row.apart_people:
+    if row.proof is not None and row.subject_independent:
         found.append(_more_people(w, row.learning))
     return found
 

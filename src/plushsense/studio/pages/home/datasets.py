@@ -9,12 +9,13 @@ from pathlib import Path
 
 from nicegui import run, ui
 
+from plushsense.dataset.files import DATASETS
 from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, button, named, on_page, tag
 from plushsense.studio.app.words import in_context
-from plushsense.studio.app.workspace import BACKUPS, DATASETS, plain_name
+from plushsense.studio.app.workspace import BACKUPS, plain_name
 from plushsense.studio.pages.home.forgetting import ForgetDialog
 from plushsense.studio.pages.home.overview import DatasetEntry, WorkspaceSummary
 from plushsense.studio.pages.home.sections import (

@@ -11,11 +11,12 @@ from markupsafe import Markup
 from nicegui import context, run, ui
 
 from plushsense.core.errors import need
+from plushsense.dataset.files import DATASETS
 from plushsense.studio.app.jobs import RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, button, html, named, on_change, on_page, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import BACKUPS, DATASETS, VIRTUAL, WORK
+from plushsense.studio.app.workspace import BACKUPS, VIRTUAL, WORK
 from plushsense.studio.pages.home.datasets import DatasetSection
 from plushsense.studio.pages.home.incoming import IncomingSection
 from plushsense.studio.pages.home.overview import NextStep, Overview, SessionEntry, WorkspaceSummary, next_step

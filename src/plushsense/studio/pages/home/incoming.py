@@ -21,7 +21,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import layout_names, load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Message
-from plushsense.dataset.files import person_folders
+from plushsense.dataset.files import DATASETS, person_folders
 from plushsense.dataset.importing.archives import UnpackLimits, member_target
 from plushsense.dataset.privacy.removed import CONSENT, refuse_removed
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
@@ -29,7 +29,7 @@ from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, heading, on_change, on_page, tag
 from plushsense.studio.app.words import Texts
-from plushsense.studio.app.workspace import BACKUPS, BUNDLES, DATASETS, PATTERNS, WORK, Workspace, plain_name
+from plushsense.studio.app.workspace import BACKUPS, BUNDLES, PATTERNS, WORK, Workspace, plain_name
 from plushsense.studio.pages.home.mapping import FileMapping, MappingPanel
 from plushsense.studio.pages.home.sections import simulation_badge, titled_card
 from plushsense.studio.widgets.elements import MAX_LINES, errors_beside, facts, folded_lines, notice

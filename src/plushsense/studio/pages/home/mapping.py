@@ -38,7 +38,7 @@ _COLUMN = "column"
 
 @dataclass
 class FileMapping:
-    """What a person has stated about files: values of a `GuessSpec`, and the code of the person if none names one."""
+    """Corrections of a guess by the user: values of a `GuessSpec`, and the person's code if the files name none."""
 
     given: dict[str, Any] = field(default_factory=dict)
     person: str = ""
