@@ -22,7 +22,7 @@ from plushsense.studio.app import connections
 from plushsense.studio.app.connections import ConnectionLimits, drop_slow_clients, limited_protocol, peer_of
 from plushsense.studio.app.guard import Guard, Visitors
 from support.browsing import connected
-from support.recording_pages import CALM, begun, files, showing, take
+from support.recording_pages import CALM, begun, files, showing, start_recording, stop, take
 from support.waiting import until
 
 Fixture = Callable[..., Any]
@@ -410,10 +410,9 @@ def test_half_requests_of_a_stranger_end_no_recording(studio: Fixture, look: Fix
         page = begun(page, at, "S01")
         take(page, 0, 0.8)
         with contextlib.ExitStack() as stack:
-            page.keyboard.press("Space")
-            showing(page, "recording.1.")
+            assert start_recording(page, 1)
             flood(stack, server.port, count)
-            page.keyboard.press("Space")
+            stop(page)
             showing(page, "idle.2.2.")
             assert status(server.port) == 401
             flood(stack, server.port, count)

@@ -82,6 +82,23 @@ def test_people_by_number_before_or_behind_the_gesture_are_listed(tmp_path: Path
         assert f"the person is taken from the path: {listed}" in guess.doubts
 
 
+@pytest.mark.parametrize("word", ["run", "file", "x", "rep"])
+def test_numbered_files_in_the_folders_of_people_are_takes(tmp_path: Path, word: str) -> None:
+    """More takes than people: the takes of different people are not those of one person."""
+    for seed, (person, gesture, take) in enumerate((p, g, t) for p in ("ann", "bob") for g in GESTURES for t in "123"):
+        touches(tmp_path / "src" / person / gesture / f"{word}{take}.csv", seed)
+    found, _, seen = guessed(tmp_path / "src")
+    assert found["paths"] == ["{subject}/{label}/{recording}.csv"]
+    assert (seen.subjects, seen.gestures) == (["ann", "bob"], {"hug": 6, "tap": 6})
+
+
+def test_runs_of_unknown_people_are_no_people(tmp_path: Path) -> None:
+    for seed, (gesture, take) in enumerate((g, t) for g in GESTURES for t in "123"):
+        touches(tmp_path / "src" / gesture / f"run{take}.csv", seed)
+    found, _, seen = guessed(tmp_path / "src")
+    assert (found["paths"], seen.subjects) == (["{label}/{recording}.csv"], ["unknown"])
+
+
 def test_clocks_and_counters_are_no_channels_whatever_they_are_called(tmp_path: Path) -> None:
     for seed, gesture in enumerate(GESTURES * 3):
         rows = 300

@@ -14,6 +14,7 @@ from plushsense.dataset.importing.pattern import PARTS
 MOST_LABELS = 60
 _PERSON = re.compile(r"(s|p|subj|subject|sub|participant|person|user|u|id|child|kid)[-_ ]?\d+", re.IGNORECASE)
 _SESSION = re.compile(r"(session|ses|day|visit|run)[-_ ]?\d*", re.IGNORECASE)
+_RUN = re.compile(r"run[-_ ]?\d+", re.IGNORECASE)
 _TAKE = re.compile(
     r"(rep|repetition|take|trial|rec|recording|sample|example|attempt|try|nr|no|n|t|r)[-_ ]?\d+", re.IGNORECASE
 )
@@ -187,6 +188,10 @@ def _roles(rows: list[list[str]], task: _PathTask, doubts: list[Message]) -> lis
     label_at = depth - 1 if task.dotted and "label" not in taken else _label_at(rows, roles, taken)
     if label_at is not None and label_at not in fixed:
         roles[label_at] = "label"
+    # In the folder of a gesture, the runs are its repetitions; elsewhere a run may be a session.
+    of_gesture = range(label_at + 1, len(roles)) if label_at is not None and label_at < depth - 1 else range(0)
+    runs = [k for k in of_gesture if roles[k] == "session" and all(_RUN.fullmatch(row[k]) for row in rows)]
+    _make_take(runs, roles, taken, fixed)
     if task.dotted and len(rows[0]) > depth and "recording" not in taken:
         roles = ["*" if role == "recording" else role for role in roles]
         roles[depth + 1] = "recording"
@@ -196,7 +201,22 @@ def _roles(rows: list[list[str]], task: _PathTask, doubts: list[Message]) -> lis
         roles[roles.index("recording")] = "session" if "session" not in taken | set(roles) else "*"
     if "subject" not in taken | set(roles):
         _person(rows, roles, set(task.labels))
+    numbered = [k for k in of_gesture if roles[k] == "*" and _one_word_numbered(row[k] for row in rows)]
+    _make_take(numbered, roles, taken, fixed)
     return roles
+
+
+def _make_take(pieces: list[int], roles: list[str], taken: set[str], fixed: Mapping[int, str]) -> None:
+    """Make the first of ``pieces`` the take, unless there is one."""
+    for k in [k for k in pieces if k not in fixed][:1]:
+        if "recording" not in taken | set(roles):
+            roles[k] = "recording"
+
+
+def _one_word_numbered(texts: Iterable[str]) -> bool:
+    """Return whether texts are one word with different numbers behind it, as ``file1``, ``file2``."""
+    found = [_NUMBERED.fullmatch(text) for text in set(texts)]
+    return len(found) > 1 and all(found) and len({m[1] for m in found if m is not None}) == 1
 
 
 def _to_check(
@@ -361,7 +381,10 @@ def _different(
 
 
 def _person(rows: list[list[str]], roles: list[str], labels: set[str]) -> None:
-    """Make the piece with the most texts the person, if there is one that stands in several files."""
+    """Make the piece with the most texts the person, if there is one that stands in several files.
+
+    A piece that reads like a session, or is one word with numbers, is the person only if no other can be.
+    """
     several = {}
     label = roles.index("label") if "label" in roles else None
     for k, role in enumerate(roles):
@@ -373,7 +396,9 @@ def _person(rows: list[list[str]], roles: list[str], labels: set[str]) -> None:
         if role in ("*", "session") and 1 < len(texts) < len(rows) and not other and re.search(r"[^\W_]", rows[0][k]):
             several[k] = texts
     if several:
-        roles[max(several, key=lambda k: (len(several[k]), rows[0][k][:1].isalpha()))] = "subject"
+        named = {k: roles[k] == "*" and not _one_word_numbered(texts) for k, texts in several.items()}
+        best = max(several, key=lambda k: (named[k], len(several[k]), rows[0][k][:1].isalpha()))
+        roles[best] = "subject"
 
 
 _TAKEN_FROM = {
