@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 import threading
@@ -292,7 +293,7 @@ class _TrialSection:
         words = self._words
         count = words("{n} of {m}", n=s.step.repetition, m=s.repetitions)
         self._gesture.set_text(f"{words.gesture(s.step.gesture)} · {count}")
-        now = {"recording": words("● Now!"), "countdown": words("In {n} …", n=f"{s.countdown_s:.0f}")}
+        now = {"recording": words("● Now!"), "countdown": words("In {n} …", n=max(1, math.ceil(s.countdown_s)))}
         self._now.set_text(now.get(s.state, words("Get ready.")))
         self._bar.set_value(s.done / s.steps)
 
