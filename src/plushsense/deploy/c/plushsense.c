@@ -39,6 +39,8 @@
 #endif
 #ifndef PLUSH_CONST
 #define PLUSH_CONST
+#elif defined(__AVR__) || (defined(ESP8266) && !defined(NON32XFER_HANDLER))
+#error "The library reads constants with plain loads of bytes, which cannot read this chip's flash: leave out PLUSH_CONST."
 #endif
 
 /* What a model may ask for, so that every sum, size and address below is sure to fit. */
@@ -676,7 +678,7 @@ PLUSH_SMALL static int has_gate(const plush_toy *toy)
 /* How many rows a phase has room for. */
 static uint32_t phase_rows(const plush_layer *layer)
 {
-    return layer->kernel + SPARE;
+    return (uint32_t)layer->kernel + SPARE; /* an int may have 16 bits */
 }
 
 /* Hands out the memory of a model that was read. Returns the bytes of it. */
@@ -882,10 +884,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
         (s) += (two & 0xffffu) + (two >> 16);                                      \
     } while (0)
-#define PLUSH_LIMIT(v, bits)           \
-    do {                               \
-        if ((v) >> (bits) != 0)        \
-            (v) = (1u << (bits)) - 1u; \
+#define PLUSH_LIMIT(v, bits)                     \
+    do {                                         \
+        if ((v) >> (bits) != 0)                  \
+            (v) = (UINT32_C(1) << (bits)) - 1u;  \
     } while (0)
 #endif
 
@@ -1933,7 +1935,7 @@ PLUSH_SMALL static void forget(plush_toy *toy)
 {
     uint32_t phase;
 
-    memset(toy->memory, 0, toy->memory_bytes);
+    memset(toy->memory, 0, (size_t)toy->memory_bytes);
     toy->waiting = 0;
     toy->heard = toy->running = 0;
     toy->block = toy->gate_deaf = 0;
