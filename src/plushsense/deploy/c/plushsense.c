@@ -803,10 +803,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 #else
 
 /* Keeps a value in a register, and what is done to it in the written order: otherwise compilers add products up in trees,
- * for which small cores have too few registers. */
+ * for which small cores have too few registers. (clang gives no number of 32 bits to a register of AVR.) */
 #if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
-#elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
+#elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__) && !(defined(__AVR__) && defined(__clang__))
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
 #else
 #define PLUSH_KEEP(v) ((void)0)
@@ -816,9 +816,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         (s) += (v);     \
         PLUSH_KEEP(s);  \
     } while (0)
+/* A product of two bytes fits an int without sign, also of 16 bits. */
 #define PLUSH_CHANNEL(i)                \
     do {                                \
-        uint32_t a = x[i];              \
+        unsigned a = x[i];              \
         PLUSH_ADD(s0, a * w[i]);        \
         PLUSH_ADD(s1, a * w[4 + (i)]);  \
         PLUSH_ADD(s2, a * w[8 + (i)]);  \
@@ -833,7 +834,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         x += 4;           \
         w += 16;          \
     } while (0)
-#if !defined(__thumb__) || defined(__thumb2__)
+#if (!defined(__thumb__) || defined(__thumb2__)) && !defined(__AVR__)
 /* Four loads, then two products, then two sums: in a pipeline, what was loaded or multiplied is there one or two cycles
  * later. */
 #define PLUSH_PRODUCTS(s, t, v)            \
