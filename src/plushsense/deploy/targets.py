@@ -192,9 +192,9 @@ def build(
         command = [compiler, *machine.flags, *source_flags, *collect, *inputs, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
         if machine.emulator:
-            source, *words = machine.emulator
-            emulator = out_dir / Path(source).stem
-            _compile(["gcc", "-O2", str(RUNTIME / source), "-o", str(emulator), *words], Path(work), source)
+            code, *words = machine.emulator
+            emulator = out_dir / Path(code).stem
+            _compile(["gcc", "-O2", str(RUNTIME / code), "-o", str(emulator), *words], Path(work), code)
             machine = replace(machine, run=(str(emulator),))
     return Program(machine, file, tuple(objects[: len(sources)]))
 
