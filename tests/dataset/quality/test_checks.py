@@ -299,6 +299,26 @@ def cut(folder: Path) -> str:
     return "P2/fulldatastream"
 
 
+def with_a_level_for_each_gesture(folder: Path) -> str:
+    """Add a level to channel 5 by which the gestures differ before they begin, as sessions of one gesture each do."""
+    for path in (folder / "recordings").rglob("*.csv"):
+        level = 40 * LABELS.index(path.name.split("_")[0])
+        change(path, lambda f, by=level: add_to_channel(f, 5, np.full(len(f), by)))
+    return ""
+
+
+def in_one_session(folder: Path) -> str:
+    """Keep one gesture of one person only, in a session of its own."""
+    (folder / "recordings" / "P2" / "s9").mkdir()
+    for path in sorted((folder / "recordings").rglob("Tail tap 1_*.csv")):
+        if path.parent.name == "P2":
+            path.rename(path.parent / "s9" / path.name)
+        else:
+            path.unlink()
+    (folder / "index.json").unlink(missing_ok=True)
+    return ""
+
+
 EVERY = slice(None)
 HIGHEST = [9999, 9999, 9999, 400, *[20000] * 9]
 standing = at_times(lambda t: t // 10**6 * 10**6)
@@ -318,6 +338,8 @@ PLANTS: list[tuple[str, str, Plant]] = [
     ("spikes", "rows", in_recording(with_values(np.arange(40, 280, 40), 11, 9000))),
     ("garbage", "failed reading", in_recording(with_values(120, 11, 8388607))),
     ("malformed", "line", malformed),
+    ("rest-tells", "levels", with_a_level_for_each_gesture),
+    ("one-session", "gesture", in_one_session),
     ("duplicate", "recording", duplicate),
     ("duplicate", "rows", copied_inside),
     ("overlap", "rows", overlapping),

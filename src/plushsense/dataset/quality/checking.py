@@ -51,6 +51,7 @@ _OVERTAKEN = "check the radio; readers leave out a single such row, and restart 
 _RESTART = "nothing: readers restart there"
 _DIGITS = "import it again, with all digits of its times or with row_rate_hz in a pattern"
 _LEFT_OUT = "nothing: that line is left out"
+_MIXED = "record each gesture in several sessions, and several gestures in each"
 
 CHECKS: dict[str, Check] = {
     "never-stopped": Check(recordings.never_stopped, (_R,), "error", "trim it to the gesture, or exclude it", True),
@@ -87,6 +88,8 @@ CHECKS: dict[str, Check] = {
     "not-in-stream": Check(comparisons.not_in_stream, (_R,), "warning", "check that the stream is this session's"),
     "missing": Check(comparisons.missing, (_P,), "warning", "record it if the person is still there, or accept"),
     "label": Check(comparisons.unknown_label, (_D,), "warning", "give a gesture set that has it, or rename the files"),
+    "rest-tells": Check(comparisons.rest_tells, (_D,), "warning", _MIXED),
+    "one-session": Check(comparisons.one_session, (_D,), "warning", _MIXED),
     "class-balance": Check(comparisons.class_balance, (_D,), "info", "weight the classes, or leave odd ones out"),
     "subject-balance": Check(comparisons.subject_balance, (_D,), "info", "weight the people, or record more"),
 }

@@ -214,6 +214,8 @@ LEVEL_KINDS = ("capacitive", "proximity")
 """Kinds of channels whose level shows touch; the level of other kinds also changes as the toy is turned."""
 NEAR_ZERO = 10
 _HOP_S = 0.1
+START_HOPS = 3
+"""Blocks of 0.1 s at the beginning of a recording, of which a summary keeps the mean."""
 _CHUNK_S = 10.0
 _NOISE = 2.0
 # Least scale of a channel's activity, as a multiple of its noise, so that channels that never move do not count.
@@ -230,7 +232,7 @@ class RecordingSummary:
     ``top_at`` are the same at the highest or lowest value ``top``, which occurs in ``top_rows`` rows. ``spread`` (C,)
     is the range from the 2nd to the 98th percentile, ``lowest`` and ``highest`` the extremes, ``zeros`` counts the rows
     that are 0 and ``near_zeros`` those from 1 to `NEAR_ZERO` steps beside it, ``low`` the 10th percentile, ``lows`` (K,
-    C) the 10th percentile of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream, and
+    C) the 10th percentile of every 10 s of a stream, ``start`` the mean of the first 0.3 s. ``content`` is a hash of the values, b"" for a stream, and
     ``hashed`` has one of each row, None for a stream.
     """
 
@@ -252,6 +254,7 @@ class RecordingSummary:
     highest: NDArray[np.int64]
     zeros: NDArray[np.int64]
     near_zeros: NDArray[np.int64]
+    start: NDArray[np.float64]
     content: bytes
     lows: NDArray[np.float64] | None = None
     hashed: HashedRows | None = None
@@ -329,6 +332,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
         values.max(axis=0),
         zeros := (values == 0).sum(axis=0),
         (np.abs(values) <= NEAR_ZERO).sum(axis=0) - zeros,
+        values[: START_HOPS * hop].mean(axis=0),
         # Hash the values only, since copies may have other names and clocks.
         b"" if stream else hashlib.sha256(np.ascontiguousarray(frames.values).tobytes()).digest(),
         lows,
