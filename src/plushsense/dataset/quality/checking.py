@@ -322,15 +322,20 @@ def author_name(who: str | None) -> str:
 
 
 def exclusions(
-    dataset: Dataset, exclude: Sequence[str] = (), include: Sequence[str] = (), *, who: str, why: str
+    dataset: Dataset, exclude: Sequence[str], include: Sequence[str], findings: Sequence[Finding], *, who: str, why: str
 ) -> list[Mark]:
-    """Return marks for the recordings to exclude or include, given as ids or patterns."""
-    return [
-        Mark(identity, action, who, why)
-        for action, patterns in (("exclude", exclude), ("include", include))
-        for pattern in patterns
-        for identity in match_ids(pattern, [r.id for r in dataset.recordings], "recording")
-    ]
+    """Return marks for the recordings to exclude or include, given as ids or patterns.
+
+    ``CHECK:PATTERN`` in ``exclude`` means those of which ``findings`` has one of the check that is not accepted.
+    """
+    known = [r.id for r in dataset.recordings]
+    marks = []
+    for entry in exclude:
+        check, pattern = parse_acceptance(entry) if ":" in entry else ("", entry)
+        found = [f.recording for f in findings if f.check == check and f.recording and not f.accepted]
+        kind = f"recording with a finding of '{check}'" if check else "recording"
+        marks += [Mark(i, "exclude", who, why) for i in match_ids(pattern or "*", found if check else known, kind)]
+    return marks + [Mark(i, "include", who, why) for entry in include for i in match_ids(entry, known, "recording")]
 
 
 def parse_acceptance(text: str) -> tuple[str, str]:
