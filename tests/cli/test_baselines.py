@@ -64,8 +64,8 @@ def test_copies_between_people_are_counted_by_split(cli: Cli, dataset: Dataset, 
     (folder / last.file).unlink()
     (folder / last.file).with_name(Path(first.file).name).write_bytes(same)
     (folder / "index.json").unlink()
-    words = ("--split", "leave-one-subject-out,windows:3", "--models", "knn", "--features", "statistics", "--pca", "no", "--workers", 1)
-    ran = cli("baselines", folder, *words, "--out", tmp_path / "OUT")
+    words = ("--split", "leave-one-subject-out,windows:3", "--models", "knn", "--features", "statistics", "--pca", "no")
+    ran = cli("baselines", folder, *words, "--workers", 1, "--out", tmp_path / "OUT")
     assert "so the scores are too high: exclude one of the two recordings" in ran.err
     splits = json.loads((tmp_path / "OUT" / "baselines.json").read_text(encoding="utf-8"))["splits"]
     by_people, by_windows = (s["leakage"] for s in splits)

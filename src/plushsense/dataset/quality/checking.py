@@ -195,7 +195,7 @@ def check(
     checks = known_checks(only)
     limits = limits or CheckLimits()
     used = dataset.used
-    usual = usual_rows((r.gesture, r.stop - r.start) for r in used)
+    usual = usual_rows((r.gesture, r.subject, r.stop - r.start) for r in used)
     findings: list[Finding] = []
     summaries: list[RecordingSummary] = []
     streams: list[RecordingSummary] = []

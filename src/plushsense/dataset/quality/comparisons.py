@@ -126,7 +126,8 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
 def flat(w: DatasetSummary) -> Iterator[Issue]:
     """Find channels that never change in a recording or stream; those constant in most recordings, once for all.
 
-    A binary or counting channel is reported only if it is constant in every recording and stream.
+    A binary or counting channel is reported only if it is constant in every recording and stream, and a coarse one not
+    where it hardly moves in the other recordings of the gesture either.
     """
     names = w.dataset.layout.names
     discrete = np.array([ch.is_discrete for ch in w.dataset.layout.channels])
@@ -143,7 +144,8 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
             severity="warning",
         )
     for o in (*long, *(s for s in w.streams if s.rows >= _FLAT_ROWS)):
-        dead = np.flatnonzero((o.runs >= o.rows) & ~always & ~discrete & ~(w.zeroed & (o.zeros == o.rows)))
+        known = always | discrete | w.still(o) | (w.zeroed & (o.zeros == o.rows))
+        dead = np.flatnonzero((o.runs >= o.rows) & ~known)
         if len(dead):
             stream = isinstance(o.info, StreamInfo)
             subject = f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'}"
@@ -193,12 +195,16 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
     if not w.recordings:
         return
     names = w.dataset.layout.names
+    longest = np.percentile([o.runs * o.period_ms for o in w.recordings], 90, axis=0)
     limit = np.maximum(w.limits.stuck_s * 1000, 10 * w.usual_run_ms)
+    # At rest between gestures, one value for a while is usual for a coarse sensor.
+    limit = np.where(w.coarse, np.maximum(limit, 2 * longest), limit)
     discrete = np.array([ch.is_discrete for ch in w.dataset.layout.channels])
     for o, least in [(o, limit) for o in w.recordings] + [(o, 4 * limit) for o in w.streams]:
         run_ms = o.runs * o.period_ms
         # The check `zeroed` reports an axis that stays at 0 because low values were replaced.
-        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows) & ~discrete & ~(w.zeroed & (o.zeros >= o.runs)))
+        known = discrete | w.still(o) | (w.zeroed & (o.zeros >= o.runs))
+        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows) & ~known)
         if not len(affected):
             continue
         c = int(affected[np.argmax(run_ms[affected])])
@@ -241,7 +247,8 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
     for o in w.recordings:
         at_rail = shared & (np.abs(o.top) >= _RAIL * rail)
         run_ms = o.top_runs * o.period_ms
-        long = np.where(at_rail, run_ms >= most / 2, run_ms >= most) & (o.top_runs >= 3)
+        # On a plateau, a coarse sensor stays at one value without being at its limit.
+        long = np.where(at_rail, run_ms >= most / 2, (run_ms >= most) & ~w.coarse) & (o.top_runs >= 3)
         often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
         moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
         affected = np.flatnonzero((long | often) & moving & ranged & (o.top >= least) & ~(w.zeroed & (o.top == 0)))
