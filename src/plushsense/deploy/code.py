@@ -14,6 +14,7 @@ from typing import Any
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.files import read_bytes
+from plushsense.core.sentences import join_names
 from plushsense.core.templates import fill_text
 from plushsense.core.toml import load_table
 from plushsense.models.bundle import Bundle
@@ -78,7 +79,7 @@ class RestFacts:
             )
         # In a sentence, a small zero would only distract.
         far = math.hypot(*self.zero) > _FAR_ZERO * self.steps
-        zero = f" around {', '.join(map(str, self.zero))}" if far else ""
+        zero = f" around {join_names(self.zero)}" if far else ""
         unit = "counts" if self.unit == "count" else self.unit
         doubt = "; estimated, as the recordings do not determine it" if self.is_estimated else ""
         return f"at rest {length}{zero} is about {self.value:,g} {unit}".rstrip() + doubt

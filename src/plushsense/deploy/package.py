@@ -274,11 +274,7 @@ def firmware(layout: Layout, scaler: Scaler, facts: ModelFacts, readings: Readin
         "wire": [names.get(field, field.upper()) for field in layout.wire],
         "kinds": {s.kind for s in sources},
         "one_g": _MPU_ONE_G,
-        "rest": [
-            (rest, c_comment(rest.sentence), list(zip(map(layout.index, rest.channels), rest.zero, strict=True)))
-            for rest in facts.rest
-            if rest.steps
-        ],
+        "rest": [layout.index(name) for rest in facts.rest[:1] if rest.steps for name in rest.channels],
         "channels": [
             {
                 "name": c_comment(channel.name),
@@ -320,7 +316,7 @@ def _sources(layout: Layout, readings: Readings | None) -> list[_ChannelSource]:
 
 
 def _motion_factor(channel: Channel, rest: Rest | None) -> tuple[str, int, str]:
-    """Return C code of the factor from sensor counts to steps of the channel, in 1/65536, the zero in steps, and a note.
+    """Return C code of the factor from sensor counts to steps of the channel, in 1/65536, the zero, and a note.
 
     The factor is "" if it cannot be computed. 1 g in steps is what was measured, else what the unit says, else what was
     estimated.

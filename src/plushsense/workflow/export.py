@@ -51,7 +51,7 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
     """
     refuse_undeployable(bundle.arch)
     dataset, people = as_dataset(dataset).with_inputs(bundle.layout), bundle.provenance.get("subjects")
-    if isinstance(people, list) and dataset.layout.reads_as(bundle.layout):
+    if bundle.readings is None and isinstance(people, list) and dataset.layout.reads_as(bundle.layout):
         bundle = replace(bundle, readings=Readings.of(dataset, people))
     if bundle.calibration and bundle.provenance.get("quantize_aware"):
         warn(Message("the bundle was fine-tuned for its own calibration, which is kept"))
