@@ -86,9 +86,9 @@ def _rest(dataset: Dataset) -> Iterable[Rest]:
         if found:
             steps = [layout.channels[i].step for i in at]
             zero = [found[0].zero[name] / step for name, step in zip(axes, steps, strict=True)]
-            yield Rest(axes, _rounded(zero), *_rounded([found[0].radius / steps[0]]), len(found) > 1)
+            yield Rest(axes, _rounded(zero), _rounded([found[0].radius / steps[0]])[0], len(found) > 1)
         elif length := length_at_rest(dataset, at):
-            yield Rest(axes, _rounded(layout.zero_int[at]), *_rounded([length]), True)
+            yield Rest(axes, _rounded(layout.zero_int[at]), _rounded([length])[0], True)
 
 
 def _rounded(numbers: Iterable[float] | NDArray[Any]) -> tuple[float, ...]:
