@@ -52,6 +52,7 @@ ON_CHIP = "examples/verify_device"
 _DEVICE = ("plush_device.h", "plush_device.c", "plush_hooks.c")
 # Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
 NO_PAGE = "https://plushsense.invalid/"
+IDF_SINCE = "5.2"  # of ESP-IDF; the examples use its driver of I2C, which is new there
 _WIRE = ("plush_wire.h", "plush_wire.c")
 _EXAMPLE = tuple(f"plush_{part}.{kind}" for part in ("reaction", "fake", "rest") for kind in "hc")
 FIRMWARE = (*_WIRE, *_EXAMPLE, "PlushToy.ino", "main.c")
@@ -96,6 +97,7 @@ def export_files(bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes]) -
     values = {
         "version": facts.model_version,
         "url": facts.url or NO_PAGE,
+        "idf_versions": f">={IDF_SINCE}",
         **_folders(name),
         "author": "The PlushSense developers",
         "sentence": "What a soft toy feels: a small streaming network in whole numbers.",
@@ -191,6 +193,7 @@ def handbook(bundle: Bundle, facts: ModelFacts) -> str:
     return _fill(
         "templates/README.md",
         facts=facts,
+        idf=IDF_SINCE,
         **_folders(facts.name),
         channels=list(zip(layout.channels, c_names(layout.names), *ranges, strict=True)),
         provenance=bundle.provenance,
@@ -262,6 +265,7 @@ def firmware(layout: Layout, scaler: Scaler, facts: ModelFacts, readings: Readin
     indent = " *     "
     values = {
         "title": c_comment(facts.title),
+        "idf": IDF_SINCE,
         "layout": c_comment(layout.name),
         "classes": facts.classes,
         "period_ms": f"{layout.period_us / 1000:g}",
