@@ -42,6 +42,8 @@ _LEAST_POINTS = 3
 # Sensors are different if their zeros are this share of 1 g apart, or their scales differ by this factor.
 _OTHER_ZERO = 0.5
 _OTHER_SCALE = 1.25
+# Where gravity is subtracted, what a sensor reads at rest is a smaller share of what it reads on average.
+_GRAVITY = 0.3
 # 1 g in units and in steps of usual digital sensors, recognised within 5 % if no other is nearly as close.
 _UNITS = {
     "g": 1.0,
@@ -314,6 +316,18 @@ def _sensors_of(dataset: Dataset, vector: tuple[str, ...]) -> Iterator[Sensor]:
     for n, fit in enumerate(groups):
         if len(members := np.flatnonzero(nearest == n)):
             yield Sensor.of(layout, vector, steps, fit, {sessions[k]: own[k] for k in members.tolist()})
+
+
+def length_at_rest(dataset: Dataset, axes: list[int]) -> float | None:
+    """Return the median length of an acceleration in the stillest blocks, in steps; None if they show no gravity."""
+    _, blocks, _ = _blocks(dataset, axes)
+    if len(blocks) < _LEAST_BLOCKS:
+        return None
+    means = blocks[:, :3] - dataset.layout.zero_int[axes]
+    still = blocks[:, 3] <= np.quantile(blocks[:, 3], _STILLEST)
+    length = float(np.median(np.linalg.norm(means[still], axis=1)))
+    moving = float(np.sqrt((means**2).sum(axis=1).mean() + 3 * (blocks[:, 3] ** 2).mean()))
+    return length if length > max(_GRAVITY * moving, 3 * float(np.median(blocks[still, 3]))) else None
 
 
 def _errors(fit: Sphere, points: Floats, owner: NDArray[np.int64], sessions: int) -> Floats:
