@@ -15,11 +15,13 @@ from typing import Any
 
 import pytest
 
+from plushsense.deploy.targets import TARGETS
 from support.browsing import LONG_MS, TABLET, axe, connected, marked
 from support.exported import bundle_of, flip, sums
 from support.requirements import LONG
 
 Fixture = Callable[..., Any]
+USUAL = {name for name, target in TARGETS.items() if not target.slow}
 
 
 def only(page: Any, target: str) -> None:
@@ -27,7 +29,7 @@ def only(page: Any, target: str) -> None:
     if not marked(page, f"target-{target}").is_visible():
         marked(page, "proof").get_by_text("More settings").click()
         marked(page, f"target-{target}").wait_for()
-    for name in {"host", "xtensa", "cortex-m4", "cortex-m0", "cortex-m33", "riscv32"} - {target}:
+    for name in USUAL - {target}:
         if marked(page, f"target-{name}").count():
             marked(page, f"target-{name}").click()
 
@@ -93,7 +95,7 @@ def test_export_verify_and_break(
 
     # What takes minutes is still there after a reload, for another browser too, and can be stopped.
     marked(page, "proof").get_by_text("More settings").click()
-    for name in ("host", "xtensa", "cortex-m0", "cortex-m33", "riscv32"):
+    for name in USUAL - {"cortex-m4"}:
         if marked(page, f"target-{name}").count():
             marked(page, f"target-{name}").click()
     flip(home / "exports" / "one" / "plush_model.c")
