@@ -142,8 +142,52 @@ def test_the_model_as_c(tmp_path: Path, c_compiler: str) -> None:
 
 
 def test_c_names() -> None:
-    labels = ("Back stroke 1", "back-stroke 1", "3 taps", "Öhr", "!", "Back stroke 1 2")
-    assert c_names(labels) == ("BACK_STROKE_1", "BACK_STROKE_1_2", "3_TAPS", "HR", "GESTURE", "BACK_STROKE_1_2_2")
+    labels = ("Back stroke 1", "back-stroke 1", "3 taps", "Öhr", "!", "Back stroke 1 2", "Ķepas glāsts", "Fuß")
+    assert c_names(labels) == (
+        *("BACK_STROKE_1", "BACK_STROKE_1_2", "3_TAPS", "OHR", "GESTURE", "BACK_STROKE_1_2_2", "KEPAS_GLASTS", "FUSS"),
+    )
+
+
+def test_a_program_knows_ranges_gap_and_names(tmp_path: Path, c_compiler: str) -> None:
+    """And its author hears of a status that it does not look at."""
+    model, bundle = made("plush-15")
+    out = tmp_path / "out"
+    emit(model, bundle, out)
+    low, high = model.layout.valid_min_int.tolist(), model.layout.valid_max_int.tolist()
+    names = c_names(model.layout.names)
+    values = [f"PLUSH_{end}_{name}" for name in names for end in ("LOWEST", "HIGHEST")]
+    header = (out / "plushsense.h").read_text(encoding="utf-8")
+    states = {
+        "STATUS": "PLUSH_NOT_ALIGNED",
+        "STATE": "PLUSH_FAULT",
+        "READING": "PLUSH_READING_LEFT_OUT",
+        "KIND": "PLUSH_SURE_GESTURE",
+        "WHAT": "PLUSH_ENDED",
+    }
+    main = tmp_path / "main.c"
+    main.write_text(
+        '#include <stdio.h>\n#include "plush_model.h"\n#include "plushsense.h"\n'
+        + "".join(f"static const char *const {name}[] = PLUSH_{name}_NAMES;\n" for name in states)
+        + "int main(void) { long n[] = {PLUSH_MODEL_GAP_MS, PLUSH_NO_READING, "
+        + f"{', '.join(values)}}}; unsigned i;\n"
+        + "".join(
+            f'puts({name}[{last}]); printf("%d\\n", (int)(sizeof {name} / sizeof {name}[0] - {last} - 1));\n'
+            for name, last in states.items()
+        )
+        + 'for (i = 0; i < sizeof n / sizeof n[0]; i++) printf("%ld ", n[i]);\nreturn 0; }\n'
+    )
+    words = [c_compiler, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", f"-I{out}", str(main)]
+    subprocess.run([*words, "-o", str(tmp_path / "run")], check=True)
+    told = subprocess.run([str(tmp_path / "run")], capture_output=True, check=True, text=True).stdout.splitlines()
+    last = [line for name in ("not aligned", "fault", "left out", "sure gesture", "ended") for line in (name, "0")]
+    assert told[:-1] == last, "the last of each enumeration, and none after it"
+    bounds = [bound for both in zip(low, high, strict=True) for bound in both]
+    assert list(map(int, told[-1].split())) == [model.layout.gap_ms, -(1 << 31), *bounds]
+    for last_one in states.values():
+        assert re.search(rf"{last_one} = \d+ +(/\*.*\*/)?\n?}}", header), "no name is missing"
+    main.write_text(main.read_text().replace("unsigned i;", "unsigned i; plush_begin(0, 0, 0, 0, 0);"))
+    careless = subprocess.run([*words, "-fsyntax-only"], capture_output=True, text=True)
+    assert careless.returncode != 0 and "unused-result" in careless.stderr
 
 
 def test_labels_cannot_break_out_of_comments(tmp_path: Path) -> None:

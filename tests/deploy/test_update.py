@@ -122,7 +122,8 @@ int main(int count, char **names)
 
     (void)count;
     start();
-    plush_begin(&alone, plush_model, PLUSH_MODEL_BYTES, other_memory, sizeof other_memory);
+    if (plush_begin(&alone, plush_model, PLUSH_MODEL_BYTES, other_memory, sizeof other_memory) != PLUSH_OK)
+        return 1;
     printf("%d\\n", same(300));
     offer(good, 0, 0, 0); /* not signed */
     offer(good, 0x5a, 1, 0); /* its end does not come */

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from importlib.metadata import version
@@ -14,6 +15,7 @@ from typing import Any
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.files import read_bytes
+from plushsense.core.layouts import Layout
 from plushsense.core.sentences import join_names
 from plushsense.core.templates import fill_text
 from plushsense.core.toml import load_table
@@ -249,7 +251,7 @@ def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
     facts = facts_of(model, bundle, image)
     return {
         **{name: text.encode() for name, text in library_files(calibrate=bool(model.layout.self_calibration)).items()},
-        MODEL[0]: _header(facts).encode(),
+        MODEL[0]: _header(facts, model.layout).encode(),
         MODEL[1]: _source(model, facts.title).encode(),
         IMAGE: image,
     }
@@ -325,11 +327,15 @@ def rest_facts(bundle: Bundle) -> tuple[RestFacts, ...]:
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:
-    """Convert labels to unique suffixes of C identifiers: ``Back stroke 1`` becomes ``BACK_STROKE_1``."""
+    """Convert labels to unique suffixes of C identifiers: ``Back stroke 1`` becomes ``BACK_STROKE_1``.
+
+    A letter with a diacritic becomes its base letter.
+    """
     suffixes: list[str] = []
     for label in labels:
-        plain = "".join(c if c.isascii() and c.isalnum() else " " for c in label)
-        name = "_".join(plain.upper().split()) or "GESTURE"
+        letters = (c for c in unicodedata.normalize("NFKD", label.upper()) if not unicodedata.combining(c))
+        plain = "".join(c if c.isascii() and c.isalnum() else " " for c in letters)
+        name = "_".join(plain.split()) or "GESTURE"
         number, free = 2, name
         while free in suffixes:
             number, free = number + 1, f"{name}_{number}"
@@ -337,9 +343,11 @@ def c_names(labels: Sequence[str]) -> tuple[str, ...]:
     return tuple(suffixes)
 
 
-def _header(facts: ModelFacts) -> str:
+def _header(facts: ModelFacts, layout: Layout) -> str:
     names = c_names([c.name for c in facts.channels])
-    channels = list(zip(names, facts.channels, strict=True))
+    # C has no literal for the lowest number.
+    lows = ("INT32_MIN" if low == -(1 << 31) else low for low in layout.valid_min_int.tolist())
+    channels = list(zip(names, facts.channels, lows, layout.valid_max_int.tolist(), strict=True))
     return fill_text("plushsense.deploy", "templates/plush_model.h.j2", facts=facts, channels=channels)
 
 

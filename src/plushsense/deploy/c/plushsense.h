@@ -4,7 +4,7 @@
  *     static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];          // from plush_model.h
  *     static plush_toy toy;
  *
- *     plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory);
+ *     status = plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory); // PLUSH_OK, or why not
  *     toy.on_event = react;                                      // void react(const plush_toy *toy, void *user)
  *     ...
  *     plush_push(&toy, milliseconds, readings);                  // every reading of the sensors
@@ -51,6 +51,14 @@ extern "C" {
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255
+#define PLUSH_NO_READING INT32_MIN /* a value for a sensor that gave none: out of the valid range of each channel that has one */
+
+/* A status that nobody looks at is a toy that never answers. */
+#if defined(__GNUC__)
+#define PLUSH_LOOK_AT __attribute__((warn_unused_result))
+#else
+#define PLUSH_LOOK_AT
+#endif
 
 /* What plush_begin, plush_swap and plush_patch say. */
 typedef enum {
@@ -103,6 +111,14 @@ typedef enum {
 } plush_what;
 
 typedef enum { PLUSH_NETWORK = 0, PLUSH_GATE = 1 } plush_source;
+
+/* Their names, for your log: static const char *const states[] = PLUSH_STATE_NAMES; */
+#define PLUSH_STATUS_NAMES \
+    {"ok", "not a model", "other version", "damaged", "memory too small", "other layout", "other model", "not aligned"}
+#define PLUSH_STATE_NAMES {"warming", "tracking", "fault"}
+#define PLUSH_READING_NAMES {"none", "waiting", "fault", "first", "used", "left out"}
+#define PLUSH_KIND_NAMES {"idle", "unknown", "unsure", "sure affect", "sure gesture"}
+#define PLUSH_WHAT_NAMES {"nothing", "begun", "named", "ended"}
 
 /* The newest thing that happened to an event: it is going on unless `what` is PLUSH_NOTHING or PLUSH_ENDED. */
 typedef struct {
@@ -236,6 +252,7 @@ uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes);
  * may write to the memory. Any bytes may be given as a model: they are looked through before anything is believed. Begin again at any
  * time, with the same model or another. Unless this says PLUSH_OK, the toy is all zeros: it takes readings, and never
  * has an answer, as a static plush_toy before its beginning. */
+PLUSH_LOOK_AT
 plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes);
 
@@ -245,6 +262,7 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
  * plush_begin(). `memory` may be that of the old model. Until PLUSH_OK the old model's bytes must stay where they are:
  * receive the new ones somewhere else. Needs a kilobyte of stack, as plush_begin() does. A checksum finds damage, not
  * forgery. */
+PLUSH_LOOK_AT
 plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                         uint32_t memory_bytes);
 
@@ -252,6 +270,7 @@ plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_byt
  * that is remembered, without warming again. The patch's bytes must stay where they are; they need no alignment. All of
  * them are looked through first: unless this says PLUSH_OK, nothing has changed. NULL brings the model's own layer back,
  * as do plush_begin() and plush_swap(); a restart does not. */
+PLUSH_LOOK_AT
 plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_bytes);
 
 /* Takes the readings of one moment in: `ms` is the toy's own clock, `values` the measured channels in the order of
