@@ -184,7 +184,7 @@ def test_a_program_knows_ranges_gap_and_names(tmp_path: Path, c_compiler: str) -
     bounds = [bound for both in zip(low, high, strict=True) for bound in both]
     assert list(map(int, told[-1].split())) == [model.layout.gap_ms, -(1 << 31), *bounds]
     for last_one in states.values():
-        assert re.search(rf"{last_one} = \d+ +(/\*.*\*/)?\n?}}", header), "no name is missing"
+        assert re.search(rf"{last_one} = \d+\s*(/\*.*\*/)?\s*}}", header), "no name is missing"
     main.write_text(main.read_text().replace("unsigned i;", "unsigned i; plush_begin(0, 0, 0, 0, 0);"))
     careless = subprocess.run([*words, "-fsyntax-only"], capture_output=True, text=True)
     assert careless.returncode != 0 and "unused-result" in careless.stderr
