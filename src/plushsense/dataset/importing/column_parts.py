@@ -422,7 +422,7 @@ def _measured(column: SampledColumn, guess: PatternDraft) -> dict[str, Any]:
 
 
 def _vectors(guess: PatternDraft) -> None:
-    """Find triples of accelerations or angular rates whose names differ only in x, y and z, or that are a list of three in JSON."""
+    """Find triples of accelerations or rates whose names differ only in x, y and z, or that are a list in JSON."""
     by_stem: dict[str, dict[str, str]] = {}
     for channel in guess.channels:
         text = channel["name"].replace("_", " ")
