@@ -74,8 +74,8 @@ class RestFacts:
         length = f"|{', '.join(self.channels)}|"
         if not self.steps:
             return (
-                f"what {length} reads at rest, so its scale, is not known: the bundle is of an earlier PlushSense; "
-                "export --dataset DS measures it"
+                f"what {length} reads at rest, so its scale, is not known: the bundle is of an earlier PlushSense or "
+                "trained on arrays; export --dataset DS measures it"
             )
         # In a sentence, a small zero would only distract.
         far = math.hypot(*self.zero) > _FAR_ZERO * self.steps
