@@ -82,7 +82,8 @@ class RestFacts:
         zero = f" around {join_names(self.zero)}" if far else ""
         unit = "counts" if self.unit == "count" else self.unit
         doubt = "; estimated, as the recordings do not determine it" if self.is_estimated else ""
-        return f"at rest {length}{zero} is about {self.value:,g} {unit}".rstrip() + doubt
+        value = f"{self.value:,.0f}" if self.value >= 100 else f"{self.value:g}"
+        return f"at rest {length}{zero} is about {value} {unit}".rstrip() + doubt
 
 
 @dataclass(frozen=True)
