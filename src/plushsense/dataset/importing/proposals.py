@@ -19,7 +19,7 @@ from plushsense.core.layouts import ACCELERATION, MEASURED, Layout
 from plushsense.core.sentences import join_names
 from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.quality.outliers import find_failed_readings
-from plushsense.dataset.statistics import median_gesture_s
+from plushsense.dataset.statistics import fitting_window_s, median_gesture_s
 from plushsense.dataset.store import Dataset, RecordingInfo
 
 DEFAULT_WINDOW_S = 2.5
@@ -464,7 +464,7 @@ def _window(dataset: Dataset) -> Iterator[Proposal]:
     if seconds is not None and seconds < DEFAULT_WINDOW_S:
         yield Proposal(
             "window_s",
-            max(0.5, round(seconds, 1)),
+            fitting_window_s(seconds),
             f"half of the recordings last less than {seconds:.1f} s, so windows of {DEFAULT_WINDOW_S} s, the default, "
             "mostly begin before their gesture",
             proven=False,
