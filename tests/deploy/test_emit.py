@@ -172,8 +172,8 @@ def test_what_is_known_of_an_accelerometer_is_a_sentence() -> None:
     ]
     assert [rest.sentence for rest in found] == [
         "at rest |x, y, z| is about 7,948 counts",
-        "at rest |x, y, z| around 0, 500000, 0 is about 2,000,000 counts; estimated, as the recordings do not determine "
-        "it",
+        "at rest |x, y, z| around 0, 500000, 0 is about 2,000,000 counts; estimated, as the recordings do not "
+        "determine it",
         "at rest |x, y, z| is about 9.807 m/s²",
         "what |x, y, z| reads at rest, so its scale, is not known: the bundle is of an earlier PlushSense or trained "
         "on arrays; export --dataset DS measures it",
