@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import itertools
 import json
 import subprocess
@@ -30,6 +32,7 @@ from plushsense.models.reference import random_weights
 from plushsense.runtime.integer import deployable
 from plushsense.windows.features import InputUnits, Scaler, network_inputs
 from support.exports import bundle_of
+from support.requirements import missing
 
 # symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
 NETS: list[tuple[str, tuple[int, ...], str, dict[str, Any]]] = [
@@ -185,14 +188,20 @@ def test_the_evaluator_of_onnx_gives_the_same_answers(net: Any, onnx_here: None)
     assert_floats(found, bundle, raw)
 
 
+def _reader(module: str) -> Any:
+    if importlib.util.find_spec(module) is None:
+        missing("readers", f"{module} is not installed")
+    return importlib.import_module(module)
+
+
 def _by_openvino(path: Path, x: Any) -> Any:
-    openvino = pytest.importorskip("openvino")
+    openvino = _reader("openvino")
     compiled = openvino.Core().compile_model(path, "CPU")
     return compiled({"raw": x})["logits"]
 
 
 def _by_opencv(path: Path, x: Any) -> Any:
-    cv2 = pytest.importorskip("cv2")
+    cv2 = _reader("cv2")
     # Its new engine gives arbitrary numbers for a kernel of 9 taps (docs/deploy.md).
     net = cv2.dnn.readNetFromONNX(str(path), cv2.dnn.ENGINE_CLASSIC)
     rows = []
@@ -207,7 +216,7 @@ def _by_opencv(path: Path, x: Any) -> Any:
 def test_readers_of_others_give_the_answers_of_the_network(
     symbol: str, reader: Callable[[Path, Any], Any], tmp_path: Path, onnx_here: None
 ) -> None:
-    """Of the files of an export, where they are installed: pip install openvino opencv-python-headless."""
+    """Of the files of an export."""
     bundle = bundle_of("plush-15", symbol, "4,6", window=60)
     out = emit(integer_model(bundle), bundle, tmp_path / "out", also=("onnx", "onnx-int8")).folder
     raw = others(bundle)[:-1]
