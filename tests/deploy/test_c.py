@@ -29,7 +29,7 @@ from plushsense.runtime.machine import Sample, ToyMachine
 from support.c_toy import answers, seat
 from support.integers import INT32, any_frames, edged_model, models, plain_model, ruled_model
 
-OK, TOO_SMALL, NOT_ALIGNED = 0, 4, 7
+OK, TOO_SMALL, NOT_ALIGNED, MEMORY_NOT_ALIGNED = 0, 4, 7, 8
 
 
 # ---- The same answers ------------------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_memory_is_what_python_says(c_library: Any, model: IntegerModel) -> None
 
 def test_misaligned_or_no_memory(c_library: Any) -> None:
     for off in (1, 2, 3):
-        assert seat(c_library, plain_model(), off=off).status == TOO_SMALL
+        assert seat(c_library, plain_model(), off=off).status == MEMORY_NOT_ALIGNED
     image = plain_model().to_bytes()
     toy = (ctypes.c_uint64 * 256)()
     assert c_library.plush_begin(toy, image, len(image), None, 1 << 20) == TOO_SMALL

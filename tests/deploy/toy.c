@@ -5,7 +5,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#define HEAD 12u
+#define HEAD 16u
 
 typedef struct {
     plush_toy toy;
@@ -30,6 +30,10 @@ static int32_t *row_of(seat *s, int32_t kind, uint32_t ms)
     row[2] = (int32_t)ms;
     row[10] = (int32_t)s->toy.restarts;
     row[11] = (int32_t)s->toy.invalid;
+    row[12] = (int32_t)s->toy.bad_stamps;
+    row[13] = (int32_t)s->toy.interpolated;
+    row[14] = s->toy.interval;
+    row[15] = s->toy.sparse;
     return row;
 }
 
@@ -157,6 +161,8 @@ void seat_age(void *p, uint32_t by)
     toy->answers += by;
     toy->restarts += by;
     toy->invalid += by;
+    toy->bad_stamps += by;
+    toy->interpolated += by;
     toy->faults += by;
     toy->event.number += by;
     toy->answer.sample += by;
@@ -488,7 +494,7 @@ int main(int argc, char **argv)
         fwrite(rows, 4, (size_t)width * s->made, stdout);
         free(frames);
         free(rows);
-        if (argc < 3 || s->toy.memory == NULL) {
+        if (argc < 3 || s->toy.held == NULL) {
             seat_free(s);
             s = NULL;
         }

@@ -31,7 +31,7 @@ class Seat:
         self.status = status.value
 
     def push(self, frames: NDArray[np.int64], silences: Sequence[int] = ()) -> NDArray[np.int32]:
-        """The rows (n, 12 + 2 K), as `answers_of` gives them, that these frames bring about."""
+        """The rows (n, 16 + 2 K), as `answers_of` gives them, that these frames bring about."""
         words = np.ascontiguousarray(frames & 0xFFFFFFFF).astype(np.uint32)
         # A frame completes one sample, and more after a gap: the rows hold them all.
         rows = np.empty((40 * len(frames) + 1000, HEAD + 2 * self.classes), dtype=np.int32)

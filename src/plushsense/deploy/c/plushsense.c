@@ -2001,6 +2001,7 @@ void plush_restart(plush_toy *toy)
     forget_health(toy);
     forget(toy);
     toy->follows = 0;
+    toy->seen_ms = 0;
 }
 
 PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
@@ -2010,7 +2011,9 @@ PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint3
 
     if (toy->self != toy)
         memset(toy, 0, sizeof *toy);
-    plush_restart(toy); /* what is going on ends while the old model can still be read */
+    else if (going_on(toy)) /* nothing here reads the old model or memory, which may be gone */
+        tell(toy, PLUSH_ENDED, toy->seen_ms, toy->seen_ms);
+    memset(toy, 0, offsetof(plush_toy, on_answer));
     status = check(model, model_bytes, "PLSH");
     if (status == PLUSH_OK)
         status = prepare(toy, model, memory, memory_bytes);
@@ -2141,7 +2144,7 @@ static int leaves_out(plush_toy *toy, uint32_t ms)
 PLUSH_CODE
 uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
 {
-    uint32_t between, due = 0, made = toy->answer.sample;
+    uint32_t between, due = 0;
 
     if (toy->held == NULL || leaves_out(toy, ms)) /* plush_begin() has not said PLUSH_OK */
         return 0;
@@ -2168,13 +2171,13 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
     }
     follow_interval(toy, ms - toy->last_ms);
     between = (ms - toy->last_ms) * toy->units_per_ms;
+    if (2 * between >= 3 * toy->period) /* all samples but the last */
+        toy->interpolated += (between - toy->due) / toy->period;
     while (toy->due <= between) { /* never for an equal stamp: a sample at the last frame's time is already made */
         interpolate(toy, toy->due, between);
         due += push_sample(toy, toy->last_ms + toy->due / toy->units_per_ms);
         toy->due += toy->period;
     }
-    if (2 * between >= 3 * toy->period)
-        toy->interpolated += toy->answer.sample - made - 1;
     toy->due -= between;
     toy->last_ms = ms;
     return due;
@@ -2187,8 +2190,10 @@ PLUSH_SMALL int plush_prime(plush_toy *toy, uint32_t ms, const int32_t *values)
     plush_push(toy, ms, values);
     if (toy->reading != PLUSH_READING_FIRST)
         return 0;
-    while (toy->warm + toy->step < toy->span)
+    while (toy->warm + toy->step < toy->span) {
+        memcpy(toy->sample, toy->held, 4u * toy->channels); /* calibrating has changed it */
         push_sample(toy, ms);
+    }
     return 1;
 }
 

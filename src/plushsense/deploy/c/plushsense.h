@@ -157,8 +157,6 @@ typedef struct plush_toy {
     uint8_t sparse;          /* a warning: the interval is over 2 periods, so most samples are made up */
     uint8_t suspect;         /* the newest frame is in doubt: no event begins on it */
     uint8_t reading;         /* what became of the newest one: a plush_reading */
-    int8_t sensitivity;      /* yours to set: how readily the network begins and keeps events; 0: as trained. Each step, up to
-                              * 127 down to -128, takes 1/512 from the probabilities that this asks for; not of the gate */
 
     /* Called with every answer, and with everything that happens to an event, also when one frame completes several;
      * may be NULL. Set them after plush_begin(). They may read the toy, but call no function that changes it
@@ -167,6 +165,9 @@ typedef struct plush_toy {
     void (*on_event)(const struct plush_toy *toy, void *user);
     void *user;
     const struct plush_toy *self; /* this toy, since its first plush_begin() */
+
+    int8_t sensitivity;      /* yours to set: how readily the network begins and keeps events; 0: as trained. Each step, up to
+                              * 127 down to -128, takes 1/512 from the probabilities that this asks for; not of the gate */
 
     /* What follows is sorted by size, so that no byte is lost between fields; cores reach the first ones with fewer
      * instructions. The model's sizes: `channels` and `layout` may be read, too: `layout` stands for the names, units, steps
