@@ -210,7 +210,7 @@ def made(layers: tuple[ConvLayer, ...], **settings_: Any) -> IntegerModel:
 
 
 def test_counts_that_do_not_fit_their_bits() -> None:
-    made((ConvLayer(2, 65530, 1),)).to_bytes()  # 65531 samples
+    made((ConvLayer(32, 2113, 1),)).to_bytes()  # 65504 samples
     with pytest.raises(BundleError, match="Layer 1 of 18d3855 1 remembers 65536 samples"):
         made((ConvLayer(18, 3855, 1),))
     made((ConvLayer(2, 1, 1),), pool=65535).to_bytes()

@@ -56,6 +56,7 @@ def golden_frames(
     generator.touches(6, garbage_channel=0)
     generator.touches(part + 300, lost=0.03, blows=0.02)
     generator.touches(part, garbage=0.05)
+    generator.touches(60, lost=0.6)
     generator.strays()
     generator.touches(part)
     generator.wait(layout.gap_ms)
@@ -164,11 +165,12 @@ class FrameGenerator:
         self.touches(20)
         self.stray(self.now + 40_000)
         self.touches(20)
-        for early_ms in (1, 8, 3, self.layout.gap_ms):
-            self.stray(self.rows[-1][0] - early_ms)
+        gap = self.layout.gap_ms
+        for early_ms in ((1, 8), (gap, gap), (3, gap + 1), (gap + 1, 2)):
+            seen = self.rows[-1][0]
+            for ms in early_ms:
+                self.stray(seen - ms)
             self.touches(2)
-        self.stray(self.rows[-1][0] - self.layout.gap_ms - 1)
-        self.stray(self.rows[-2][0] - 2)
         self.touches(20)
         self.stray(0)
         self.stray(self.now + 80_000)

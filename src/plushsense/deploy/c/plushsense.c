@@ -1195,7 +1195,7 @@ static uint32_t setting(const plush_toy *toy, uint32_t which)
 
 /* A probability that an event asks for: 1/512 less for each step of the sensitivity. Settings above 1 are never reached. */
 PLUSH_APART
-static int32_t level(const plush_toy *toy, uint32_t which)
+static int32_t least_share(const plush_toy *toy, uint32_t which)
 {
     int32_t trained = (int32_t)setting(toy, which);
 
@@ -1254,6 +1254,7 @@ static int going_on(const plush_toy *toy)
     return toy->event.what == PLUSH_BEGUN || toy->event.what == PLUSH_NAMED;
 }
 
+PLUSH_CODE
 static void tell(plush_toy *toy, plush_what what, uint32_t since, uint32_t ms)
 {
     toy->event.what = what;
@@ -1330,7 +1331,7 @@ static uint32_t affect_alone(const plush_toy *toy)
             affect = other;
         }
     }
-    return (int32_t)most >= level(toy, ENTER_AFFECT) ? affect : 0u;
+    return (int32_t)most >= least_share(toy, ENTER_AFFECT) ? affect : 0u;
 }
 
 /* How many steps in a row the same was wanted. */
@@ -1368,6 +1369,7 @@ static void closed_step(plush_toy *toy, uint32_t said, uint32_t affect, uint32_t
 }
 
 /* Whether something else than the event was wanted for long enough to take its place. */
+PLUSH_APART
 static int another(const plush_toy *toy, uint32_t said, uint32_t affect)
 {
     const plush_event *event = &toy->event;
@@ -1389,9 +1391,9 @@ static int stays(const plush_toy *toy, uint32_t best)
     if (is_idle(toy, best) && share_of(toy, best) >= setting(toy, ENTER))
         return 0;
     if (event->gesture != PLUSH_NO_GESTURE)
-        return (int32_t)share_of(toy, event->gesture) >= level(toy, LEAVE);
+        return (int32_t)share_of(toy, event->gesture) >= least_share(toy, LEAVE);
     /* Begun by the gate, it may have nothing to be recognised by. */
-    return event->affect != PLUSH_AFFECT_NONE && (int32_t)mass_of(toy, event->affect) >= level(toy, LEAVE_AFFECT);
+    return event->affect != PLUSH_AFFECT_NONE && (int32_t)mass_of(toy, event->affect) >= least_share(toy, LEAVE_AFFECT);
 }
 
 static void open_step(plush_toy *toy, uint32_t best, uint32_t said, uint32_t affect, uint32_t ms)
@@ -1429,7 +1431,7 @@ static void event_step(plush_toy *toy, uint32_t best, uint32_t ms)
     if (!toy->suspect) {
         if (toy->answer.kind == PLUSH_UNKNOWN || toy->answer.kind == PLUSH_IDLE) {
             /* nothing is wanted */
-        } else if (toy->answer.confidence >= level(toy, ENTER)) {
+        } else if (toy->answer.confidence >= least_share(toy, ENTER)) {
             said = best;
             affect = affect_of(toy, best);
         } else {
@@ -1609,7 +1611,7 @@ static void gate_sample(plush_toy *toy, uint32_t ms)
 /* ---- Health ---------------------------------------------------------------------------------------------------- */
 
 /* Whether a value lies between two that stand in the model. */
-PLUSH_APART
+PLUSH_CODE
 static int lies_in(const uint8_t *range, int32_t value)
 {
     return value >= as_signed(le32(range)) && value <= as_signed(le32(range + 4));
@@ -1695,7 +1697,7 @@ static int32_t follow_mean(const plush_toy *toy, int32_t *mean, int32_t x, uint3
 }
 
 /* One more sample, up to 2^15; `mean_shift` is the binary logarithm of their number. */
-static void count_means(plush_toy *toy)
+PLUSH_SMALL PLUSH_CODE static void count_means(plush_toy *toy)
 {
     if (toy->mean_samples >> MOST_MEAN_SHIFT != 0)
         return;
@@ -2180,6 +2182,19 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
     }
     toy->due -= between;
     toy->last_ms = ms;
+    return due;
+}
+
+PLUSH_SMALL uint32_t plush_push_many(plush_toy *toy, const int32_t *frames, uint32_t n, uint32_t last_ms, uint32_t period_us)
+{
+    uint32_t due = 0;
+
+    for (; n > 0; frames += toy->channels) {
+        uint32_t early_ms = (--n * period_us + 999) / 1000;
+
+        if (early_ms <= last_ms)
+            due += plush_push(toy, last_ms - early_ms, frames);
+    }
     return due;
 }
 

@@ -256,6 +256,11 @@ plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_by
  * toy->reading tells why. */
 uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values);
 
+/* The same for `n` frames in turn, as the buffer (FIFO) of a sensor holds them: the last one was measured at `last_ms`, each
+ * other one `period_us` before the next (104 Hz: 9615 us), rounded down to whole ms. Their span is less than an hour.
+ * Frames from before the time 0 are left out. */
+uint32_t plush_push_many(plush_toy *toy, const int32_t *frames, uint32_t n, uint32_t last_ms, uint32_t period_us);
+
 /* Begins again as if `values`, a reading of the toy at rest, had come for as long as the network looks back, until `ms`:
  * the first answer then falls due a step later, not only when the toy has warmed. For the end of a sleep or a silence.
  * What is going on ends; on_answer sees the steps on the way, warming. Takes as long as those steps (tens of ms on most
