@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, HEAD, HEALTH, TRACKING, Vectors, column
+from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, HEALTH, TRACKING, Vectors, column
 from plushsense.runtime.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, SOURCES
 
 

@@ -86,7 +86,9 @@ def test_equal_stamps_are_counted() -> None:
     assert clock.bad_stamps == 2
 
 
-@pytest.mark.parametrize(("every_ms", "jitter", "sparse"), [(10, 2, False), (15, 0, False), (25, 0, True), (40, 3, True)])
+@pytest.mark.parametrize(
+    ("every_ms", "jitter", "sparse"), [(10, 2, False), (15, 0, False), (25, 0, True), (40, 3, True)]
+)
 def test_the_interval_is_measured_and_missing_readings_are_counted(every_ms: int, jitter: int, sparse: bool) -> None:
     clock, rng, made = SampleClock(ACCEL), np.random.default_rng(0), 0
     for t in range(0, 4000, every_ms):

@@ -334,8 +334,8 @@ def answers_of(model: IntegerModel, frames: Ints, calls: Sequence[Call] = ()) ->
     A row is an answer, a change of an event, or a change of the sensor health. It has the columns of `COLUMNS`, then K
     logits in steps of 1/256 and K smoothed probabilities in steps of 2^-27. These and the columns ``gesture`` to
     ``known`` are 0 in an answer before the toy tracks. ``frame`` is the index of the frame that caused the row,
-    ``restarts`` to ``sparse`` are those of the clock up to then; times and counts wrap at 2^32. Changes of events come before
-    the answer of the same step, changes of health after all other rows of the frame.
+    ``restarts`` to ``sparse`` are those of the clock up to then; times and counts wrap at 2^32. Changes of events come
+    before the answer of the same step, changes of health after all other rows of the frame.
 
     Args:
         calls: what is called between the frames: ``plush_silence``, ``plush_prime`` with the frame before, or a change
@@ -532,9 +532,9 @@ class Vectors:
         pieces = [_counted(self.model.to_bytes() if self.model else b"")]
         frames = (self.frames & 0xFFFFFFFF).astype("<u4")
         between = [(at, struct.pack("<I", _PATCH) + _counted(patch)) for at, patch in self.patches]
-        for at, action, value in self.calls:
-            more = [value & 0xFFFFFFFF] if action == "sensitivity" else [] if action == "silence" else frames[at].tolist()
-            between.append((at, struct.pack(f"<{1 + len(more)}I", _ACTIONS[action], *more)))
+        for at, called, value in self.calls:
+            more = {"silence": [], "prime": frames[at].tolist(), "sensitivity": [value & 0xFFFFFFFF]}[called]
+            between.append((at, struct.pack(f"<{1 + len(more)}I", _ACTIONS[called], *more)))
         begin = 0
         for at, action in (*sorted(between), (len(frames) - 1, struct.pack("<I", _END))):
             pieces += [struct.pack("<I", at + 1 - begin), frames[begin : at + 1].tobytes(), action]

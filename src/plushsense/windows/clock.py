@@ -30,12 +30,11 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.row_times import kept_rows
 
-
 _MOST_INTERVAL = (1 << 16) - 1
 
 
 def burst_ms(n: int, last_ms: int, period_us: int) -> list[int]:
-    """Return the times of ``n`` readings, the last at ``last_ms``, like ``plush_push_many``; those before 0 are missing.
+    """Return the times of ``n`` readings, the last at ``last_ms``, like ``plush_push_many``, without those before 0.
 
     Times between two milliseconds are rounded down, as stamps of a clock are.
     """

@@ -18,10 +18,11 @@
  *
  * Missed ticks. Readings carry the time at which they were taken, and only that time counts: reading late, or several
  * at once, changes no answer. Readings that are missing for up to the model's gap (100 ms as a rule) are bridged by
- * interpolation, and every answer that fell due meanwhile is given, in order. A reading after a longer gap, or whose clock
- * runs backwards (also when it wraps after 2^32 ms), is left out, so that a single wrong time does no harm. If the next one
- * does not follow on the last one that was used either, everything remembered is dropped: the toy is warming again. What
- * was going on ends then, with that reading; if none may ever come, call plush_silence() when you miss it.
+ * interpolation, and every answer that fell due meanwhile is given, in order. A reading that is earlier than the last one, by
+ * no more than the gap, is left out: stamps of buffered readings (FIFO) are often a few ms off. A reading after a longer gap,
+ * or whose clock runs backwards further (also when it wraps after 2^32 ms), is left out, too, so that a single wrong time does
+ * no harm. If the next one does not follow on the last one that was used either, everything remembered is dropped: the toy is
+ * warming again. What was going on ends then, with that reading; if none may ever come, call plush_silence() when you miss it.
  *
  * Time has steps of 1 ms. A reading is taken to be up to 1 ms older than it is; of readings every 10 ms with stamps that are
  * cut to whole ms, a movement of 3 Hz differs by 0.5 % of its size (rms), one of 10 Hz by 1.6 %, and stamps of a timer that
@@ -83,7 +84,7 @@ typedef enum {
     PLUSH_READING_FAULT = 2,    /* passed over: the sensors cannot be believed */
     PLUSH_READING_FIRST = 3,    /* used as the first of a stream: after the start, a gap, a clock that ran backwards, a fault */
     PLUSH_READING_USED = 4,     /* used to go on; 0 answers fell due unless it completed a step */
-    PLUSH_READING_LEFT_OUT = 5  /* left out: its time is before that of the one before, or further after it than the gap */
+    PLUSH_READING_LEFT_OUT = 5  /* left out: its time is before that of the last one used, or further after it than the gap */
 } plush_reading;
 
 /* What an answer is worth. */
@@ -159,8 +160,9 @@ typedef struct plush_toy {
     uint8_t reading;         /* what became of the newest one: a plush_reading */
 
     /* Called with every answer, and with everything that happens to an event, also when one frame completes several;
-     * may be NULL. Set them after plush_begin(). They may read the toy, but call no function that changes it
-     * (plush_push, plush_silence, plush_restart, plush_begin, plush_swap, plush_patch). A step's event comes before its answer. */
+     * may be NULL. One frame may end an event and begin the next one: in on_event remember both, not only the newest.
+     * Set them after the first plush_begin(). They may read the toy, but call no function that changes it
+     * (plush_push, plush_prime, plush_silence, plush_restart, plush_begin, plush_swap, plush_patch). A step's event comes before its answer. */
     void (*on_answer)(const struct plush_toy *toy, void *user);
     void (*on_event)(const struct plush_toy *toy, void *user);
     void *user;
@@ -231,8 +233,9 @@ uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes);
 
 /* Makes a toy ready. The model's bytes and the memory must stay where they are, both at a multiple of 4, and only the toy
  * may write to the memory. Any bytes may be given as a model: they are looked through before anything is believed. Begin again at any
- * time, with the same model or another. Unless this says PLUSH_OK, the toy is all zeros: it takes readings, and never
- * has an answer, as a static plush_toy before its beginning. */
+ * time, with the same model or another: what is going on ends, which on_event is told; callbacks and sensitivity stay, counts
+ * begin anew. Unless this says PLUSH_OK, the toy is all zeros: it takes readings, and never has an answer, as a static
+ * plush_toy before its beginning. */
 plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes);
 
