@@ -1675,6 +1675,7 @@ static int examine(plush_toy *toy, uint32_t ms, const int32_t *values)
 /* ---- Samples and frames ---------------------------------------------------------------------------------------- */
 
 /* A channel of the even sample, from its zero. */
+PLUSH_CODE
 static int32_t from_zero(const plush_toy *toy, uint32_t channel)
 {
     return as_signed((uint32_t)toy->sample[channel] - le32(toy->ranges + RANGE_BYTES * channel + 8));
