@@ -39,6 +39,8 @@
 #endif
 #ifndef PLUSH_CONST
 #define PLUSH_CONST
+#elif defined(__AVR__) || (defined(ESP8266) && !defined(NON32XFER_HANDLER))
+#error "The library reads constants with plain loads of bytes, which cannot read this chip's flash: leave out PLUSH_CONST."
 #endif
 
 /* What a model may ask for, so that every sum, size and address below is sure to fit. */
@@ -679,7 +681,7 @@ PLUSH_SMALL static int has_gate(const plush_toy *toy)
 /* How many rows a phase has room for. */
 static uint32_t phase_rows(const plush_layer *layer)
 {
-    return layer->kernel + SPARE;
+    return (uint32_t)layer->kernel + SPARE; /* an int may have 16 bits */
 }
 
 /* Hands out the memory of a model that was read. Returns the bytes of it. */
@@ -803,10 +805,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 #else
 
 /* Keeps a value in a register, and what is done to it in the written order: otherwise compilers add products up in trees,
- * for which small cores have too few registers. */
+ * for which small cores have too few registers. (clang gives no number of 32 bits to a register of AVR.) */
 #if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
-#elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
+#elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__) && !(defined(__AVR__) && defined(__clang__))
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
 #else
 #define PLUSH_KEEP(v) ((void)0)
@@ -816,9 +818,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         (s) += (v);     \
         PLUSH_KEEP(s);  \
     } while (0)
+/* A product of two bytes fits an int without sign, also of 16 bits. */
 #define PLUSH_CHANNEL(i)                \
     do {                                \
-        uint32_t a = x[i];              \
+        unsigned a = x[i];              \
         PLUSH_ADD(s0, a * w[i]);        \
         PLUSH_ADD(s1, a * w[4 + (i)]);  \
         PLUSH_ADD(s2, a * w[8 + (i)]);  \
@@ -833,7 +836,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         x += 4;           \
         w += 16;          \
     } while (0)
-#if !defined(__thumb__) || defined(__thumb2__)
+#if (!defined(__thumb__) || defined(__thumb2__)) && !defined(__AVR__)
 /* Four loads, then two products, then two sums: in a pipeline, what was loaded or multiplied is there one or two cycles
  * later. */
 #define PLUSH_PRODUCTS(s, t, v)            \
@@ -884,10 +887,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
         (s) += (two & 0xffffu) + (two >> 16);                                      \
     } while (0)
-#define PLUSH_LIMIT(v, bits)           \
-    do {                               \
-        if ((v) >> (bits) != 0)        \
-            (v) = (1u << (bits)) - 1u; \
+#define PLUSH_LIMIT(v, bits)                     \
+    do {                                         \
+        if ((v) >> (bits) != 0)                  \
+            (v) = (UINT32_C(1) << (bits)) - 1u;  \
     } while (0)
 #endif
 
