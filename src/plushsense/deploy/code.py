@@ -126,6 +126,9 @@ class ModelFacts:
     period_us: int
     rate_hz: float
     gap_ms: int
+    fault_ms: int
+    still_ms: int
+    recover_ms: int
     smoothing: int
     parameters: int
     macs_per_step: int
@@ -292,6 +295,9 @@ def facts_of(model: IntegerModel, bundle: Bundle, image: bytes) -> ModelFacts:
         period_us=layout.period_us,
         rate_hz=layout.rate_hz,
         gap_ms=layout.gap_ms,
+        fault_ms=model.rules.health.fault_ms,
+        still_ms=model.rules.health.still_ms,
+        recover_ms=model.rules.health.recover_ms,
         smoothing=model.smoothing,
         parameters=arch.parameters,
         macs_per_step=arch.macs_per_step,
