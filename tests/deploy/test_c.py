@@ -18,18 +18,19 @@ from hypothesis import strategies as st
 
 TESTS = Path(__file__).parents[1]
 
-from plushsense.deploy.golden import EVENT, answers_of, column
+from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, answers_of, column
 from plushsense.runtime.decisions import Rules
-from plushsense.runtime.events import NO_GESTURE, EventSettings
+from plushsense.runtime.events import BEGUN, NO_GESTURE, EventSettings
 from plushsense.runtime.fixed import exponentials
 from plushsense.runtime.gate import DOUBT, JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel, memory_bytes
 from plushsense.runtime.machine import Sample, ToyMachine
+from plushsense.windows.clock import burst_ms
 from support.c_toy import answers, seat
 from support.integers import INT32, any_frames, edged_model, models, plain_model, ruled_model
 
-OK, TOO_SMALL, NOT_ALIGNED = 0, 4, 7
+OK, TOO_SMALL, NOT_ALIGNED, MEMORY_NOT_ALIGNED = 0, 4, 7, 8
 
 
 # ---- The same answers ------------------------------------------------------------------------------------------------
@@ -107,7 +108,7 @@ def test_memory_is_what_python_says(c_library: Any, model: IntegerModel) -> None
 
 def test_misaligned_or_no_memory(c_library: Any) -> None:
     for off in (1, 2, 3):
-        assert seat(c_library, plain_model(), off=off).status == TOO_SMALL
+        assert seat(c_library, plain_model(), off=off).status == MEMORY_NOT_ALIGNED
     image = plain_model().to_bytes()
     toy = (ctypes.c_uint64 * 256)()
     assert c_library.plush_begin(toy, image, len(image), None, 1 << 20) == TOO_SMALL
@@ -120,6 +121,64 @@ def test_misaligned_or_no_memory(c_library: Any) -> None:
         assert status == (TOO_SMALL if aligned else NOT_ALIGNED)
         size = c_library.plush_memory_bytes(ctypes.c_void_p(at), len(image))
         assert size == (memory_bytes(plain_model()) if aligned else 0)
+
+
+# ---- Stamps, priming, probabilities ----------------------------------------------------------------------------------
+
+
+def test_a_buffer_of_readings_is_stamped_as_in_python(c_library: Any) -> None:
+    """Read 8 at a time at 104 Hz, by an interrupt that is up to 27 ms late: nothing restarts."""
+    model, times, last_ms, rows = plain_model(), list[int](), 20, []
+    toy = seat(c_library, model)
+    toy.push(np.empty((0, 5), dtype=np.int64))
+    frames = any_frames(model, 3, 400)
+    frames[:, 1:] = np.clip(frames[:, 1:], 0, 100)
+    for at, late in zip(range(0, 400, 8), (0, 19, 3, 27, 0, 14) * 9, strict=False):
+        times += (burst := burst_ms(8, last_ms + late, 9615))
+        frames[at : at + 8, 0] = [-1] * (8 - len(burst)) + burst
+        rows.append(toy.push_many(frames[at : at + 8, 1:], last_ms + late, 9615))
+        last_ms += 77
+    expected = answers_of(model, frames[frames[:, 0] >= 0])
+    assert len(times) < 400, "some come from before the clock's beginning"
+    assert np.array_equal(np.delete(np.concatenate(rows), 1, axis=1), np.delete(expected, 1, axis=1))
+    assert expected[-1, COLUMNS[ANSWER].index("restarts")] == 0 < expected[-1, COLUMNS[ANSWER].index("bad_stamps")]
+
+
+def test_a_primed_toy_answers_with_the_next_step(c_library: Any) -> None:
+    model = plain_model()
+    arch, frames = model.network.arch, any_frames(model, 3, 300)
+    frames[:, 1:] = np.clip(frames[:, 1:], 0, 100)
+    rest = frames[0, 1:].astype(np.int32)
+    toy = seat(c_library, model)
+    assert toy.prime(int(frames[0, 0]), rest) == 1
+    rows = answers(toy.push(frames[1 : 2 + arch.step]))
+    assert rows[0, 3] == 1, "tracking"
+    # As if the reading had come all the time.
+    still = np.concatenate([np.tile(frames[:1], (arch.span - arch.step, 1)), frames[1:]])
+    still[:, 0] = 1000 + 10 * np.arange(len(still))
+    assert (
+        np.array_equal(rows[:, 9:], answers(seat(c_library, model).push(still))[-len(rows) :, 9:]) or model.rules.gate
+    )
+    shares = [c_library.seat_probability(toy.toy, k) for k in range(arch.classes)]
+    bytes_ = [int(v) * 255 // (1 << 27) for v in rows[-1, 9 + arch.classes :]]
+    assert shares == bytes_ and c_library.seat_probability(toy.toy, 255) == 0
+    wrong = rest.copy()
+    wrong[0] = INT32[0]
+    assert toy.prime(0, wrong) == 0 and seat(c_library, model).prime(0, rest) == 1
+
+
+def test_beginning_again_ends_what_goes_on_and_keeps_the_callbacks(c_library: Any) -> None:
+    blow = Rule((Term(0, 24, times=1),), 3, NO_GESTURE, within=2, deaf=3)
+    gate = GateSettings((Signal(JERK, (1,), lag=3, shift=4, baseline=4, noise=4),), (blow,))
+    model, frames = replace(ruled_model(1), rules=Rules(gate=gate)), any_frames(ruled_model(1), 1, 700)
+    toy, image = seat(c_library, model), model.to_bytes()
+    rows = answers_of(model, frames)
+    begun = rows[(rows[:, 0] == EVENT) & (rows[:, 4] == BEGUN)][-1]
+    toy.push(frames[: begun[1] + 1])
+    assert c_library.seat_begin_again(toy.toy, image, len(image)) == OK
+    assert c_library.seat_made(toy.toy) == 1, "the end, by the callback set before"
+    frames = any_frames(model, 4, 500)
+    assert np.array_equal(toy.push(frames), answers_of(model, frames))
 
 
 # ---- Restarts, several toys, other models ----------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 TESTS = Path(__file__).parents[1]
 
 
-from plushsense.deploy.golden import EVENT, FAULT, HEALTH, ToyRows, answers_of, column
+from plushsense.deploy.golden import EVENT, FAULT, HEAD, HEALTH, ToyRows, answers_of, column
 from plushsense.runtime.events import ENDED
 from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
 from plushsense.runtime.image import IntegerModel, image_head
@@ -414,7 +414,7 @@ def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: P
         status, made = struct.unpack_from("<iI", out, at)
         statuses.append(status)
         classes = image[16 + 3] if status == OK else 0
-        at += 8 + 4 * made * (12 + 2 * classes)
+        at += 8 + 4 * made * (HEAD + 2 * classes)
     assert at == len(out)
     assert statuses.count(OK) > 200
     assert statuses.count(DAMAGED) > 1000
@@ -443,7 +443,7 @@ def test_sanitizers_find_nothing_in_swaps(sanitized: list[Path], tmp_path: Path)
         status, made = struct.unpack_from("<iI", out, at)
         statuses.append(status)
         classes = image[16 + 3] if status == OK else classes
-        at += 8 + 4 * made * (12 + 2 * classes)
+        at += 8 + 4 * made * (HEAD + 2 * classes)
     assert at == len(out)
     assert all(status == OK for status, fine in zip(statuses, good, strict=True) if fine)
     assert sum(status != OK for status in statuses) > 100

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from plushsense.core.layouts import MOST_CALIBRATED_OTHER, Channel
 from plushsense.deploy.code import CALIBRATE, LIBRARY, library_files
-from plushsense.deploy.golden import answers_of
+from plushsense.deploy.golden import HEAD, answers_of
 from plushsense.deploy.package import ARDUINO, IDF
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
@@ -51,8 +51,8 @@ def test_what_was_found_out_survives_a_gap_but_no_other_model(calibrated_library
     assert status == OK
     after = answers_of(model, second)
     swapped = toy.push(second)
-    assert np.array_equal(swapped[:, 12:], after[:, 12:])
-    assert not np.array_equal(whole[-len(after) :, 12:], after[:, 12:]), "the first model had calibrated itself"
+    assert np.array_equal(swapped[:, HEAD:], after[:, HEAD:])
+    assert not np.array_equal(whole[-len(after) :, HEAD:], after[:, HEAD:]), "the first model had calibrated itself"
 
 
 def test_each_library_takes_its_own_models(c_library: Any, calibrated_library: Any) -> None:

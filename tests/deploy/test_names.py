@@ -13,7 +13,7 @@ import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.deploy.code import BUNDLE, code_files, prefixed, read_facts, without_prefix
-from plushsense.deploy.golden import ANSWER, read_golden
+from plushsense.deploy.golden import ANSWER, HEAD, read_golden
 from plushsense.deploy.package import emit
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.quantize import integer_model
@@ -104,7 +104,7 @@ def test_several_models_in_one_program_answer_as_alone(
         channels, classes = len(read_facts(folder).channels), read_facts(folder).classes
         frames[name], rows = read_golden(folder / "golden", channels, classes)
         rows = rows[(rows[:, 0] == ANSWER) & (rows[:, 1] < FRAMES) & (rows[:, 4] == 1)]
-        expected += [f"{name} {row[3]} {' '.join(map(str, row[12 : 12 + classes]))}" for row in rows.tolist()]
+        expected += [f"{name} {row[3]} {' '.join(map(str, row[HEAD : HEAD + classes]))}" for row in rows.tolist()]
     stream = b"".join((frames[name][n] & 0xFFFFFFFF).astype("<u4").tobytes() for n in range(FRAMES) for name in named)
     done = subprocess.run([program], input=stream, capture_output=True, check=True)
     got = done.stdout.decode().splitlines()

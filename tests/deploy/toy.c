@@ -5,7 +5,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#define HEAD 12u
+#define HEAD 16u
 
 typedef struct {
     plush_toy toy;
@@ -13,6 +13,7 @@ typedef struct {
     uint32_t *memory, memory_bytes;
     int32_t *rows;
     uint32_t frame, made, most;
+    int32_t ended[1][HEAD + 2u * 255u]; /* what plush_begin() ends */
 } seat;
 
 /* A row as golden/answers.bin has it: kind, frame and ms, seven that depend on the kind, the counts; zeros. */
@@ -30,6 +31,10 @@ static int32_t *row_of(seat *s, int32_t kind, uint32_t ms)
     row[2] = (int32_t)ms;
     row[10] = (int32_t)s->toy.restarts;
     row[11] = (int32_t)s->toy.invalid;
+    row[12] = (int32_t)s->toy.bad_stamps;
+    row[13] = (int32_t)s->toy.interpolated;
+    row[14] = s->toy.interval;
+    row[15] = s->toy.sparse;
     return row;
 }
 
@@ -144,6 +149,30 @@ uint32_t seat_push(void *p, const int32_t *frames, uint32_t n, uint32_t channels
     return due == s->toy.answers - answered ? s->made : UINT32_MAX;
 }
 
+/* As plush_push_many() and plush_prime() do; the rows as of seat_push(). Returns how many there were. */
+uint32_t seat_push_many(void *p, const int32_t *values, uint32_t n, uint32_t last_ms, uint32_t period_us, int32_t *rows,
+                        uint32_t most)
+{
+    seat *s = (seat *)p;
+    uint32_t answered = s->toy.answers;
+
+    s->rows = rows;
+    s->made = 0;
+    s->most = most;
+    return plush_push_many(&s->toy, values, n, last_ms, period_us) == s->toy.answers - answered ? s->made : UINT32_MAX;
+}
+
+int seat_prime(void *p, uint32_t ms, const int32_t *values)
+{
+    ((seat *)p)->most = 0;
+    return plush_prime(&((seat *)p)->toy, ms, values);
+}
+
+uint32_t seat_probability(void *p, uint8_t gesture)
+{
+    return plush_probability(&((seat *)p)->toy, gesture);
+}
+
 void seat_restart(void *p)
 {
     plush_restart(&((seat *)p)->toy);
@@ -157,6 +186,8 @@ void seat_age(void *p, uint32_t by)
     toy->answers += by;
     toy->restarts += by;
     toy->invalid += by;
+    toy->bad_stamps += by;
+    toy->interpolated += by;
     toy->faults += by;
     toy->event.number += by;
     toy->answer.sample += by;
@@ -177,6 +208,9 @@ int seat_begin_again(void *p, const uint8_t *model, uint32_t bytes)
     s->memory = (uint32_t *)realloc(s->memory, needed);
     s->memory_bytes = needed;
     s->frame = 0;
+    s->rows = &s->ended[0][0];
+    s->made = 0;
+    s->most = 1;
     return (int)plush_begin(&s->toy, s->model, bytes, s->memory, needed);
 }
 
@@ -261,6 +295,11 @@ const char *seat_name(void *p, uint8_t gesture)
 const char *seat_title(void *p)
 {
     return plush_model_title(&((seat *)p)->toy);
+}
+
+uint32_t seat_made(void *p)
+{
+    return ((seat *)p)->made;
 }
 
 uint32_t seat_reading(void *p)
@@ -488,7 +527,7 @@ int main(int argc, char **argv)
         fwrite(rows, 4, (size_t)width * s->made, stdout);
         free(frames);
         free(rows);
-        if (argc < 3 || s->toy.memory == NULL) {
+        if (argc < 3 || s->toy.held == NULL) {
             seat_free(s);
             s = NULL;
         }

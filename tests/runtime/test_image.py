@@ -178,9 +178,9 @@ def test_what_a_toy_cannot_hold() -> None:
     model = plain_model()
     layout, gestures = model.layout, model.gestures.gestures
     odd = dataclasses.replace(layout, rate_hz=104.0)  # a period of 9615 us: 200 units a ms
-    other(model, layout=dataclasses.replace(odd, gap_ms=20971)).to_bytes()
-    with pytest.raises(BundleError, match="at 104 Hz the toy accepts 1 to 20971 ms"):
-        other(model, layout=dataclasses.replace(odd, gap_ms=20972))
+    other(model, layout=dataclasses.replace(odd, gap_ms=9624)).to_bytes()
+    with pytest.raises(BundleError, match="at 104 Hz the toy accepts 1 to 9624 ms"):
+        other(model, layout=dataclasses.replace(odd, gap_ms=9625))
     for smoothing in (0, -1, 32769):
         with pytest.raises(BundleError, match="accepted are 1 to 32768"):
             other(model, smoothing=smoothing)
@@ -210,7 +210,7 @@ def made(layers: tuple[ConvLayer, ...], **settings_: Any) -> IntegerModel:
 
 
 def test_counts_that_do_not_fit_their_bits() -> None:
-    made((ConvLayer(32, 2114, 1),)).to_bytes()  # 65535 samples
+    made((ConvLayer(32, 2113, 1),)).to_bytes()  # 65504 samples
     with pytest.raises(BundleError, match="Layer 1 of 18d3855 1 remembers 65536 samples"):
         made((ConvLayer(18, 3855, 1),))
     made((ConvLayer(2, 1, 1),), pool=65535).to_bytes()

@@ -31,7 +31,7 @@ class Seat:
         self.status = status.value
 
     def push(self, frames: NDArray[np.int64], silences: Sequence[int] = ()) -> NDArray[np.int32]:
-        """The rows (n, 12 + 2 K), as `answers_of` gives them, that these frames bring about."""
+        """The rows (n, 16 + 2 K), as `answers_of` gives them, that these frames bring about."""
         words = np.ascontiguousarray(frames & 0xFFFFFFFF).astype(np.uint32)
         # A frame completes one sample, and more after a gap: the rows hold them all.
         rows = np.empty((40 * len(frames) + 1000, HEAD + 2 * self.classes), dtype=np.int32)
@@ -60,6 +60,21 @@ class Seat:
         if status.value == 0:
             self.classes = classes
         return status.value, rows[:made]
+
+    def push_many(self, values: NDArray[np.int64], last_ms: int, period_us: int) -> NDArray[np.int32]:
+        """The rows that a burst of readings (n, C) brings about."""
+        words = np.ascontiguousarray(values).astype(np.int32)
+        rows = np.empty((40 * len(values) + 40, HEAD + 2 * self.classes), dtype=np.int32)
+        pointer = ctypes.c_void_p(rows.ctypes.data)
+        at = ctypes.c_void_p(words.ctypes.data)
+        made = self.library.seat_push_many(self.toy, at, len(words), last_ms, period_us, pointer, len(rows))
+        return rows[:made]
+
+    def prime(self, ms: int, values: NDArray[np.int32]) -> int:
+        """Prime the toy with a reading (C,); whether it took it."""
+        return int(
+            self.library.seat_prime(self.toy, ctypes.c_uint32(ms & 0xFFFFFFFF), ctypes.c_void_p(values.ctypes.data))
+        )
 
     def patch(self, patch: bytes | None) -> int:
         """Offer a patch, or None for the model's own layer: the status. Nothing but the layer may have changed."""
@@ -101,6 +116,9 @@ def library_of(path: Path) -> Any:
         getattr(library, name).restype = ctypes.c_char_p
     for name in (
         "seat_push",
+        "seat_push_many",
+        "seat_made",
+        "seat_probability",
         "seat_swap",
         "seat_answers",
         "seat_reading",

@@ -66,7 +66,7 @@ def any_layout(draw: st.DrawFn, calibrated: bool = False) -> Layout:
         derived=derived,
         inputs=tuple(inputs),
         csv=CsvFormat(("device_ms",), ("device_ms",), ","),
-        gap_ms=draw(st.sampled_from((30, 100, 250, 4000))),
+        gap_ms=draw(st.sampled_from((30, 100, 250, 3000))),
         vectors=tuple(vectors),
         self_calibration=themselves,
     )

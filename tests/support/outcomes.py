@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, HEAD, HEALTH, TRACKING, Vectors, column
+from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, HEALTH, TRACKING, Vectors, column
 from plushsense.runtime.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, SOURCES
 
 
@@ -24,6 +24,7 @@ def outcomes_of(scenario: Vectors) -> set[str]:
     at = {name: n for n, name in enumerate(COLUMNS[EVENT])}
     state, warm, ended = COLUMNS[ANSWER].index("state"), False, None
     frame = COLUMNS[ANSWER].index("frame")
+    silent = {call.frame for call in scenario.calls if call.action != "sensitivity"}
     for n, row in enumerate(rows.tolist()):
         after = rows[n + 1].tolist() if n + 1 < len(rows) else None
         if row[0] == ANSWER:
@@ -54,8 +55,8 @@ def outcomes_of(scenario: Vectors) -> set[str]:
                     outcomes.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
                 elif after is not None and after[0] == HEALTH and after[frame] == row[frame] and after[state] == 2:
                     outcomes.add("lost in a fault")
-                elif row[frame] in scenario.silences and row[at["since"]] == row[at["ms"]]:
+                elif row[frame] in silent and row[at["since"]] == row[at["ms"]]:
                     outcomes.add("lost in silence")
-                elif after is not None and after[HEAD - 2] > row[HEAD - 2]:
+                elif after is not None and after[at["restarts"]] > row[at["restarts"]]:
                     outcomes.add("lost in a gap")
     return outcomes

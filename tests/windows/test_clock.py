@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.row_times import kept_rows
-from plushsense.windows.clock import SampleClock, resample, row_times_us
+from plushsense.windows.clock import SampleClock, burst_ms, resample, row_times_us
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +40,7 @@ def test_linear_between_frames_rounded_half_up() -> None:
 
 
 def test_gaps_and_resets_start_again_at_the_second_frame() -> None:
-    given_frames = frames([0, 100, 201, 211, 150, 160], [[i, 0, 0] for i in range(6)])
+    given_frames = frames([0, 100, 201, 311, 110, 120], [[i, 0, 0] for i in range(6)])
     out = resample(given_frames, ACCEL)
     assert [s.first_row for s in out] == [0, 3, 5], "100 ms are bridged, 101 ms are not, nor two steps back"
     assert [s.last_row for s in out] == [2, 4, 6]
@@ -60,6 +60,43 @@ def test_one_impossible_time_is_bridged(wrong: list[int]) -> None:
     clock = SampleClock(ACCEL)
     kept = [(len(clock.push(t, row)), clock.left_out)[1] for t, row in zip(times, rows, strict=True)]
     assert kept.count(True) == 1 and clock.restarts == 0
+
+
+def test_a_buffer_whose_stamps_overlap_costs_nothing() -> None:
+    """A driver reads 8 readings at 104 Hz at a time, and stamps them from the time at which it reads them."""
+    times, read = list[int](), 1000
+    for late in (0, 19, 3, 27, 0, 14) * 4:
+        read += 77
+        times += burst_ms(8, read + late, 9615)
+    given_frames = frames(times, [[t, 0, 0] for t in times])
+    (segment,) = resample(given_frames, ACCEL)
+    assert np.array_equal(segment.data[:, 0], times[0] + 10 * np.arange(len(segment))), "a ramp stays one"
+    clock = SampleClock(ACCEL)
+    for t in times:
+        clock.push(t, (t, 0, 0))
+    assert (clock.restarts, clock.bad_stamps) == (0, len(times) - len(kept_rows(given_frames.device_ms, 100)))
+    assert clock.bad_stamps == 15 and not clock.sparse
+    assert burst_ms(3, 15, 9615) == [5, 15], "none before the clock's beginning"
+
+
+def test_equal_stamps_are_counted() -> None:
+    clock = SampleClock(ACCEL)
+    for t in (0, 10, 10, 10, 20):
+        clock.push(t, (0, 0, 0))
+    assert clock.bad_stamps == 2
+
+
+@pytest.mark.parametrize(
+    ("every_ms", "jitter", "sparse"), [(10, 2, False), (15, 0, False), (25, 0, True), (40, 3, True)]
+)
+def test_the_interval_is_measured_and_missing_readings_are_counted(every_ms: int, jitter: int, sparse: bool) -> None:
+    clock, rng, made = SampleClock(ACCEL), np.random.default_rng(0), 0
+    for t in range(0, 4000, every_ms):
+        made += len(clock.push(t + int(rng.integers(-jitter, jitter + 1)) + jitter, (0, 0, 0)))
+    assert abs(clock.interval / 256 - every_ms) < 0.1 + jitter / 4 and clock.sparse == sparse
+    if jitter == 0:
+        assert clock.interpolated == {15: 133, 25: made - 160}[every_ms], "every other interval of 15 ms holds two"
+    assert (clock.interpolated > 0) == (every_ms > 10)
 
 
 @pytest.mark.parametrize("wrong", [[0, 0], [0, 5], [0, 20_000], [20_000, 0]])
@@ -128,8 +165,10 @@ def in_turn(clock: list[int], gap_ms: int) -> list[int]:
     """Return the rows that rule 1 keeps, one after the other, as it is worded."""
     kept, left_out = [0], False
     for at in range(1, len(clock)):
-        odd = not 0 <= clock[at] - clock[kept[-1]] <= gap_ms
-        left_out = odd and not left_out
+        step = clock[at] - clock[kept[-1]]
+        if -gap_ms <= step < 0:
+            continue
+        left_out = not 0 <= step <= gap_ms and not left_out
         if not left_out:
             kept.append(at)
     return kept

@@ -9,17 +9,24 @@ from numpy.typing import NDArray
 def kept_rows(device_ms: NDArray[np.int64], gap_ms: float) -> NDArray[np.int64]:
     """Return the rows that rule 1 of `plushsense.windows.clock` keeps, in order.
 
-    A row is left out if its clock is earlier than in the row before, or more than ``gap_ms`` later, unless that row is
-    left out, too. Between two kept rows such a step is a gap or a reset of the clock.
+    Between two kept rows, a step back or of more than ``gap_ms`` is a reset of the clock or a gap.
     """
+    rows = np.arange(len(device_ms), dtype=np.int64)
     step = np.diff(device_ms)
-    odd = np.flatnonzero((step < 0) | (step > gap_ms)) + 1
+    odd = np.flatnonzero((step < 0) | (step > gap_ms))
     if not len(odd):
-        return np.arange(len(device_ms), dtype=np.int64)
-    # Of odd rows in turn, every other one is left out, from the first.
-    turn = np.arange(len(odd))
-    first = np.maximum.accumulate(np.where(np.diff(odd, prepend=-1) > 1, turn, 0))
-    return np.delete(np.arange(len(device_ms), dtype=np.int64), odd[(turn - first) % 2 == 0])
+        return rows
+    first = int(odd[0])
+    seen, out_of_order, left_out = int(device_ms[first]), False, []
+    for row, time in enumerate(device_ms[first + 1 :].tolist(), first + 1):
+        late = -gap_ms <= time - seen < 0
+        if not late:
+            out_of_order = not out_of_order and not 0 <= time - seen <= gap_ms
+        if late or out_of_order:
+            left_out.append(row)
+        else:
+            seen = time
+    return np.delete(rows, left_out)
 
 
 def stray_rows(device_ms: NDArray[np.int64], gap_ms: float) -> NDArray[np.int64]:

@@ -30,7 +30,7 @@ MODEL = ("plush_model.h", "plush_model.c")
 GOLDEN = "golden"
 FACTS = "export.json"
 MOST_FILE_BYTES = 16 << 20  # that are read of a file of an export, other than golden vectors
-TOY_BYTES = 516  # size of a plush_toy with 32-bit pointers (a test compiles it)
+TOY_BYTES = 488  # size of a plush_toy with 32-bit pointers (a test compiles it)
 
 _FAR_ZERO = 0.05
 _MOST_NAME = 10  # so that an Arduino library called NAME_plush has at most the 16 characters that arduino-lint accepts
@@ -129,6 +129,9 @@ class ModelFacts:
     period_us: int
     rate_hz: float
     gap_ms: int
+    fault_ms: int
+    still_ms: int
+    recover_ms: int
     smoothing: int
     parameters: int
     macs_per_step: int
@@ -295,6 +298,9 @@ def facts_of(model: IntegerModel, bundle: Bundle, image: bytes) -> ModelFacts:
         period_us=layout.period_us,
         rate_hz=layout.rate_hz,
         gap_ms=layout.gap_ms,
+        fault_ms=model.rules.health.fault_ms,
+        still_ms=model.rules.health.still_ms,
+        recover_ms=model.rules.health.recover_ms,
         smoothing=model.smoothing,
         parameters=arch.parameters,
         macs_per_step=arch.macs_per_step,

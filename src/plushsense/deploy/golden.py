@@ -6,10 +6,10 @@ No recordings are used, because exports are given to others and must not contain
 from __future__ import annotations
 
 import struct
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,7 @@ def golden_frames(
     generator.touches(6, garbage_channel=0)
     generator.touches(part + 300, lost=0.03, blows=0.02)
     generator.touches(part, garbage=0.05)
+    generator.touches(60, lost=0.6)
     generator.strays()
     generator.touches(part)
     generator.wait(layout.gap_ms)
@@ -155,12 +156,21 @@ class FrameGenerator:
         self.now = following + self.pace()
 
     def strays(self) -> None:
-        """Add three single frames with impossible times, which are bridged, and two in turn, which restart."""
+        """Add frames with impossible times: three single ones, which are bridged, some a little early, which are left
+        out however many they are, and two in turn, which restart.
+        """
         for zeros in (False, True):
             self.touches(20)
             self.stray(0, zeros=zeros)
         self.touches(20)
         self.stray(self.now + 40_000)
+        self.touches(20)
+        gap = self.layout.gap_ms
+        for early_ms in ((1, 8), (gap, gap), (3, gap + 1), (gap + 1, 2)):
+            seen = self.rows[-1][0]
+            for ms in early_ms:
+                self.stray(seen - ms)
+            self.touches(2)
         self.touches(20)
         self.stray(0)
         self.stray(self.now + 80_000)
@@ -285,24 +295,16 @@ def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArr
 
 FRAMES, ANSWERS = "frames.bin", "answers.bin"
 ANSWER, EVENT, HEALTH, PATCH = range(4)
+_COUNTS = ("restarts", "invalid", "bad_stamps", "interpolated", "interval", "sparse")
 # The columns of each kind of row; logits and probabilities follow, which are 0 except in answers.
 COLUMNS = {
-    ANSWER: (
-        *("kind", "frame", "ms", "sample", "state", "gesture", "affect", "confidence", "answer", "known"),
-        *("restarts", "invalid"),
-    ),
-    EVENT: (
-        *("kind", "frame", "ms", "number", "what", "gesture", "affect", "source", "since", "unused"),
-        *("restarts", "invalid"),
-    ),
-    HEALTH: (
-        *("kind", "frame", "ms", "faults", "state", "suspect", "unused", "unused", "unused", "unused"),
-        *("restarts", "invalid"),
-    ),
-    PATCH: (
-        *("kind", "frame", "ms", "status", "unused", "unused", "unused", "unused", "unused", "unused"),
-        *("restarts", "invalid"),
-    ),
+    kind: ("kind", "frame", "ms", *own, *["unused"] * (7 - len(own)), *_COUNTS)
+    for kind, own in {
+        ANSWER: ("sample", "state", "gesture", "affect", "confidence", "answer", "known"),
+        EVENT: ("number", "what", "gesture", "affect", "source", "since"),
+        HEALTH: ("faults", "state", "suspect"),
+        PATCH: ("status",),
+    }.items()
 }
 HEAD = len(COLUMNS[ANSWER])
 WARMING, TRACKING, FAULT = range(3)
@@ -318,19 +320,28 @@ def column(rows: NDArray[Any], name: str, kind: int = ANSWER) -> NDArray[Any]:
     return np.asarray(rows[rows[:, 0] == kind][:, COLUMNS[kind].index(name)])
 
 
-def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ()) -> NDArray[np.int32]:
-    """Compute the rows (m, 12 + 2 K) int32 that the toy returns for frames (n, 1 + C), whose first column is in ms.
+class Call(NamedTuple):
+    """A call of the toy after the frame with the index ``frame``; ``value`` is the sensitivity that is set."""
+
+    frame: int
+    action: Literal["silence", "prime", "sensitivity"]
+    value: int = 0
+
+
+def answers_of(model: IntegerModel, frames: Ints, calls: Sequence[Call] = ()) -> NDArray[np.int32]:
+    """Compute the rows (m, 16 + 2 K) int32 that the toy returns for frames (n, 1 + C), whose first column is in ms.
 
     A row is an answer, a change of an event, or a change of the sensor health. It has the columns of `COLUMNS`, then K
     logits in steps of 1/256 and K smoothed probabilities in steps of 2^-27. These and the columns ``gesture`` to
     ``known`` are 0 in an answer before the toy tracks. ``frame`` is the index of the frame that caused the row,
-    ``restarts`` and ``invalid`` are the counts up to then; times and counts wrap at 2^32. Changes of events come before
-    the answer of the same step, changes of health after all other rows of the frame.
+    ``restarts`` to ``sparse`` are those of the clock up to then; times and counts wrap at 2^32. Changes of events come
+    before the answer of the same step, changes of health after all other rows of the frame.
 
     Args:
-        silences: indices of the frames after which a silence is reported (``plush_silence``).
+        calls: what is called between the frames: ``plush_silence``, ``plush_prime`` with the frame before, or a change
+            of the sensitivity.
     """
-    return ToyRows(model).read(frames, silences)
+    return ToyRows(model).read(frames, calls)
 
 
 def answers_over_patches(
@@ -366,14 +377,15 @@ class ToyRows:
         self._affects = [AFFECT_CODES[a] for a in model.gestures.affects]
         self._rows: list[list[int]] = []
 
-    def read(self, frames: Ints, silences: Container[int] = ()) -> NDArray[np.int32]:
+    def read(self, frames: Ints, calls: Sequence[Call] = ()) -> NDArray[np.int32]:
         """Return the rows for further frames."""
-        self.feed(frames, silences)
+        self.feed(frames, calls)
         return self.take()
 
-    def feed(self, frames: Ints, silences: Container[int] = ()) -> None:
+    def feed(self, frames: Ints, calls: Sequence[Call] = ()) -> None:
         """Feed frames to the toy and add the resulting rows."""
         health = self.toy.frames.health
+        after = {call.frame: call for call in calls}
         for ms, *values in frames.tolist():
             before = health.fault, health.suspect
             for moment in self.toy.push(ms, values):
@@ -381,8 +393,13 @@ class ToyRows:
             if (health.fault, health.suspect) != before:
                 state = FAULT if health.fault else WARMING if self.toy.samples.warming else TRACKING
                 self._add(HEALTH, ms, health.faults, state, int(health.suspect))
-            if self.frame in silences:
-                self.add(self.toy.silence())
+            call = after.get(self.frame)
+            if call is not None and call.action == "sensitivity":
+                self.toy.samples.sensitivity = call.value
+            elif call is not None:
+                moments = self.toy.prime(ms, values) if call.action == "prime" else [self.toy.silence()]
+                for moment in moments:
+                    self.add(moment)
             self.frame += 1
 
     def take(self) -> NDArray[np.int32]:
@@ -415,8 +432,8 @@ class ToyRows:
         return (time_us + self.toy.frames.zero_us) // 1000
 
     def _add(self, kind: int, ms: int, *values: int, numbers: Sequence[int] = ()) -> None:
-        counts = self.toy.frames.clock.restarts, self.toy.frames.clock.invalid
-        row = [kind, self.frame, ms, *values, *[0] * (HEAD - 5 - len(values)), *counts, *numbers]
+        counts = (int(getattr(self.toy.frames.clock, name)) for name in _COUNTS)
+        row = [kind, self.frame, ms, *values, *[0] * (7 - len(values)), *counts, *numbers]
         self._rows.append(row + [0] * (HEAD + 2 * len(self._affects) - len(row)))
 
 
@@ -445,7 +462,7 @@ def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path
 
 
 def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArray[np.int32]]:
-    """Read the frames (n, 1 + C) and rows (m, 12 + 2 K) of a folder.
+    """Read the frames (n, 1 + C) and rows (m, 16 + 2 K) of a folder.
 
     Raises:
         BadInput: if a file is missing or its size is not a multiple of the row size.
@@ -479,10 +496,10 @@ class Vectors:
 
     Attributes:
         frames: (n, 1 + C), the time in ms and the channels.
-        answers: (m, 12 + 2 K), as `answers_of` computes them.
+        answers: (m, 16 + 2 K), as `answers_of` computes them.
         samples: length of the resampled frames.
         model: model to run, if not that of the export.
-        silences: indices of the frames after which a silence is reported.
+        calls: what is called between the frames.
         patches: indices of the frames after which a patch is offered, and its bytes; none: the patch is undone.
     """
 
@@ -491,7 +508,7 @@ class Vectors:
     answers: NDArray[np.int32]
     samples: int
     model: IntegerModel | None = None
-    silences: tuple[int, ...] = ()
+    calls: tuple[Call, ...] = ()
     patches: tuple[tuple[int, bytes], ...] = ()
 
     @property
@@ -511,11 +528,14 @@ class Vectors:
         return sum(-(-n // 4) * 4 for n in (model, *(len(patch) for _, patch in self.patches)))
 
     def to_bytes(self) -> bytes:
-        """Serialise for the test program, whose source describes the format: model, frames, silences and patches."""
+        """Serialise for the test program, whose source describes the format: model, frames, calls and patches."""
         pieces = [_counted(self.model.to_bytes() if self.model else b"")]
-        between = [(at, struct.pack("<I", _SILENCE)) for at in self.silences]
-        between += [(at, struct.pack("<I", _PATCH) + _counted(patch)) for at, patch in self.patches]
-        frames, begin = (self.frames & 0xFFFFFFFF).astype("<u4"), 0
+        frames = (self.frames & 0xFFFFFFFF).astype("<u4")
+        between = [(at, struct.pack("<I", _PATCH) + _counted(patch)) for at, patch in self.patches]
+        for at, called, value in self.calls:
+            more = {"silence": [], "prime": frames[at].tolist(), "sensitivity": [value & 0xFFFFFFFF]}[called]
+            between.append((at, struct.pack(f"<{1 + len(more)}I", _ACTIONS[called], *more)))
+        begin = 0
         for at, action in (*sorted(between), (len(frames) - 1, struct.pack("<I", _END))):
             pieces += [struct.pack("<I", at + 1 - begin), frames[begin : at + 1].tobytes(), action]
             begin = at + 1
@@ -523,7 +543,8 @@ class Vectors:
 
 
 # What comes after frames.
-_END, _SILENCE, _PATCH = range(3)
+_END, _PATCH = 0, 2
+_ACTIONS = {"silence": 1, "prime": 3, "sensitivity": 4}
 
 
 def _counted(data: bytes) -> bytes:

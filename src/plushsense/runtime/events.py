@@ -134,10 +134,13 @@ class Answer:
 class EventMachine:
     """Decides the events of one stream. ``mean`` holds the smoothed probabilities (K,) in steps of 2^-27, then the
     smoothed known score in steps of 2^-20; None before the first step.
+
+    ``sensitivity`` (-128 to 127) is how readily the network begins and keeps events: each step takes 1/512 from
+    ``enter``, ``leave``, ``enter_affect`` and ``leave_affect``, unless they are above 1. The gate does not change.
     """
 
     def __init__(self, settings: EventSettings, smoothing: int, gestures: GestureSet) -> None:
-        self.settings, self.smoothing = settings, smoothing
+        self.settings, self.smoothing, self.sensitivity = settings, smoothing, 0
         self._affects = [AFFECT_CODES[a] for a in gestures.affects]
         self._idle = np.array([g.idle for g in gestures.gestures], dtype=np.bool_)
         self.reset()
@@ -248,6 +251,9 @@ class EventMachine:
             return [self._end(self._away_since, now)]
         return []
 
+    def _level(self, trained: int) -> int:
+        return trained if trained > ONE else trained - ONE // 512 * self.sensitivity
+
     def _kind(self, shares: list[int], best: int, known: int) -> int:
         settings = self.settings
         if self._idle[best]:
@@ -274,11 +280,11 @@ class EventMachine:
         """Return the candidate of a step: gesture (or `NO_GESTURE`) and affect; (`NO_GESTURE`, 0) for none."""
         if answer.kind in (UNKNOWN, IDLE):
             return NO_GESTURE, 0
-        if answer.share >= self.settings.enter:
+        if answer.share >= self._level(self.settings.enter):
             return answer.best, self._affects[answer.best]
         totals = self._affect_shares(shares)
         most = max(range(1, 4), key=lambda a: (totals[a], -a))
-        return NO_GESTURE, most if totals[most] >= self.settings.enter_affect else 0
+        return NO_GESTURE, most if totals[most] >= self._level(self.settings.enter_affect) else 0
 
     def _count(self, gesture: int, affect: int, now: int) -> None:
         """Count successive steps with the same candidate."""
@@ -325,7 +331,7 @@ class EventMachine:
             ended = self._end(now, now)
             return [ended, self._begin(affect, self._named(gesture), CNN, now, now)]
         share = shares[self.gesture] if self.gesture != NO_GESTURE else self._affect_shares(shares)[self.affect]
-        stays = share >= (settings.leave if self.gesture != NO_GESTURE else settings.leave_affect)
+        stays = share >= self._level(settings.leave if self.gesture != NO_GESTURE else settings.leave_affect)
         if self.gesture == NO_GESTURE and self.affect == 0:
             stays = False  # begun by the gate without affect: no share to compare
         if self._idle[best] and shares[best] >= settings.enter:

@@ -72,10 +72,11 @@ IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
 SPARE = 4  # rows for new samples in each phase of a streaming layer
 MOST_TAPS = 255  # of a vector layer
-MOST_ROWS = (1 << 16) - 1  # samples that a layer remembers
+MOST_ROWS = (1 << 16) - 1 - SPARE  # samples that a layer remembers
 _DENSE = "dense layer"  # how the descriptions of its sections begin
 _INPUT_KINDS = ("channel", "magnitude", "gravity")
 MOST_CLOCK_UNITS = 1 << 22  # limit for gap and period of the clock: interpolation then needs at most 32 bits
+MOST_BRIDGED = 1000  # samples in a gap, all of which one call of ``plush_push`` computes
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +129,12 @@ class IntegerModel:
             raise BundleError(
                 f"The smoothing weight is {self.smoothing}: accepted are 1 to {1 << PROBABILITY_BITS} (no smoothing)."
             )
-        if not 1 <= self.layout.gap_ms * self._units_per_ms <= MOST_CLOCK_UNITS:
+        bridged = (MOST_BRIDGED + 1) * self.layout.period_us - 1
+        most_ms = min(MOST_CLOCK_UNITS // self._units_per_ms, bridged // 1000)
+        if not 1 <= self.layout.gap_ms <= most_ms:
             raise BundleError(
                 f"Layout '{self.layout.name}' bridges gaps of {self.layout.gap_ms} ms: at {self.layout.rate_hz:g} Hz "
-                f"the toy accepts 1 to {MOST_CLOCK_UNITS // self._units_per_ms} ms."
+                f"the toy accepts 1 to {most_ms} ms."
             )
         for derived in self.layout.derived:
             if len(derived.of) > 255:

@@ -94,7 +94,7 @@ class FrameReader:
     Attributes:
         zero_us: device time at which the stream's time is 0; it changes if the device clock is reset.
         time_us: time of the newest frame that was not left out.
-        clock: leaves out single frames out of order; counts restarts and invalid values.
+        clock: leaves out single frames out of order; counts what becomes of frames, and measures their interval.
         health: detects and counts sensor faults.
     """
 
@@ -118,7 +118,17 @@ class FrameReader:
     def count_from(self, other: FrameReader) -> None:
         """Continue with the counts of another reader."""
         self.health.faults = other.health.faults
-        self.clock.restarts, self.clock.invalid = other.clock.restarts, other.clock.invalid
+        self.clock.count_from(other.clock)
+
+    def prime(self, device_ms: int, values: Sequence[int], n: int) -> Iterator[Sample | Break]:
+        """Begin a new segment with a frame; yield ``n`` samples of its values, none if they cannot be used."""
+        self.clock.restart()
+        self.health.clear()
+        self._inputs.reset()
+        for item in self.push(device_ms, values):
+            yield item
+            for _ in range(n - 1):
+                yield Sample(self.time_us, self._inputs(self._calibration.push(list(values))), self.health.suspect)
 
     def push(self, device_ms: int, values: Sequence[int]) -> Iterator[Sample | Break]:
         """Process one frame; yield samples and breaks. When one is yielded, counts and ``zero_us`` are valid for it.
@@ -196,17 +206,32 @@ class SampleReader:
     def reset(self) -> None:
         """Begin a new stream and set the number of events to 0."""
         self._events.reset()
-        self._restart()
+        self.restart()
 
     def count_from(self, other: SampleReader) -> None:
         """Continue with the event numbers of another reader."""
-        self._events.number = other._events.number
+        self._events.number, self.sensitivity = other._events.number, other.sensitivity
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Discard all earlier samples."""
         self._network.reset()
         self._gate.reset()
         self.samples = 0
         self._block: list[list[int]] = []  # inputs since the last step, for one call of the network
+
+    @property
+    def rest_samples(self) -> int:
+        """Number of samples after which the next step has an answer."""
+        return max(1, self._span - self._step)
+
+    @property
+    def sensitivity(self) -> int:
+        """How readily the network begins events, see `EventMachine`."""
+        return self._events.sensitivity
+
+    @sensitivity.setter
+    def sensitivity(self, value: int) -> None:
+        self._events.sensitivity = value
 
     @property
     def warming(self) -> bool:
@@ -225,7 +250,7 @@ class SampleReader:
                 yield from self._sample(*item)
             else:
                 yield self.lose(item.time_us, item.reason)
-                self._restart()
+                self.restart()
 
     def lose(self, time_us: int, reason: BreakReason) -> Moment:
         """End the open event, because the signal is lost."""
@@ -295,6 +320,16 @@ class ToyMachine:
         self.samples.count_from(other.samples)
         self.frames.count_from(other.frames)
         return ended
+
+    def prime(self, device_ms: int, values: Sequence[int]) -> Iterator[Moment]:
+        """Begin again as if the values of a frame, of a toy at rest, had come for a span, like ``plush_prime``.
+
+        The next step then has an answer, unless a value is out of its range or sensors are at fault. The first moment
+        ends the open event.
+        """
+        yield self.silence()
+        self.samples.restart()
+        yield from self.samples.read(self.frames.prime(device_ms, values, self.samples.rest_samples))
 
     def silence(self) -> Moment:
         """End the open event, because no frame has arrived for a while.

@@ -2,16 +2,19 @@
 
 A whole recording, a live stream and a toy's chip get identical samples, since all computations are in integers:
 
-1. A frame is out of order if its device clock is earlier than that of the frame before, or more than
-   ``layout.gap_ms`` later. It is left out, as if it had been lost, and the next frame is compared with the last one
-   that was not left out. If that is out of order, too, it starts a new segment: all state of later computations is
-   then reset. So a single impossible clock value is bridged, and a gap or a reset of the clock costs one frame.
+1. Each frame is compared with the last one that was not left out. If its device clock is earlier, by at most
+   ``layout.gap_ms``, it is left out, as if it had been lost: drivers that stamp the readings of a buffer together are
+   often a few ms off. If it is earlier by more, or later by more than ``layout.gap_ms``, it is out of order: it is left
+   out, too, but a second such frame in turn starts a new segment, and all state of later computations is then reset. So
+   a single impossible clock value is bridged, and a gap or a reset of the clock costs one frame.
 2. A value outside the valid range of its channel is replaced by the channel's last valid value in the segment. Frames
    are skipped until every channel has had a valid value.
 3. The first frame that is not skipped sets the time of sample 0; sample k is due ``k * period_us`` later. It is
    computed when the first frame at or after its time arrives, by linear interpolation between the two frames around
    it, rounded half up: ``x0 + floor((2 (x1 - x0) (t - t0) + (t1 - t0)) / (2 (t1 - t0)))``. Of several frames with
    equal times, the first ends the interval before them, and the last starts the interval after them.
+
+For a live stream the clock also measures the interval between the frames, as a toy does.
 """
 
 from __future__ import annotations
@@ -26,6 +29,17 @@ from numpy.typing import NDArray
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.row_times import kept_rows
+
+_MOST_INTERVAL = (1 << 16) - 1
+
+
+def burst_ms(n: int, last_ms: int, period_us: int) -> list[int]:
+    """Return the times of ``n`` readings, the last at ``last_ms``, like ``plush_push_many``, without those before 0.
+
+    Times between two milliseconds are rounded down, as stamps of a clock are.
+    """
+    early = [-(-at * period_us // 1000) for at in range(n - 1, -1, -1)]
+    return [last_ms - ms for ms in early if ms <= last_ms]
 
 
 def row_times_us(frames: Frames, layout: Layout) -> NDArray[np.int64]:
@@ -68,6 +82,11 @@ class SampleClock:
     Attributes:
         restarts: number of segments that a gap or a clock reset began.
         invalid: number of values outside their valid range.
+        bad_stamps: number of frames that rule 1 left out, or that have the time of the frame before.
+        interpolated: number of samples made up for frames that did not come: of each interval of 1.5 periods or more,
+            all but one.
+        interval: interval between frames in 1/256 ms, smoothed over 16 of them; at most 255 ms. 0 before the first.
+        sparse: whether the interval is more than two periods, so that most samples are made up.
         left_out: whether rule 1 left the newest frame out.
         restarted: whether the newest frame started a new segment because of a gap or a clock reset.
     """
@@ -77,10 +96,16 @@ class SampleClock:
         self._high = [int(v) for v in layout.valid_max_int]
         self._period = layout.period_us
         self._gap = layout.gap_ms * 1000
-        self.restarts = 0
-        self.invalid = 0
-        self.left_out = self.restarted = False
+        self.restarts = self.invalid = self.bad_stamps = self.interpolated = 0
+        self.interval = 0
+        self.left_out = self.restarted = self.sparse = False
+        self._follows = False  # the frame before was in order
         self._seen_us: int | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Start a new segment with the next frame, whatever its time."""
+        self._seen_us, self._follows = None, False
         self.forget()
 
     def forget(self) -> None:
@@ -107,13 +132,21 @@ class SampleClock:
     def accept(self, device_ms: int) -> bool:
         """Apply rule 1 to the time of the next frame; return False if the frame is left out."""
         time = int(device_ms) * 1000
-        seen = self._seen_us
-        odd = seen is not None and (time < seen or time - seen > self._gap)
-        self.left_out = odd and not self.left_out
-        self.restarted = odd and not self.left_out
+        step = 0 if self._seen_us is None else time - self._seen_us
+        late, in_order = -self._gap <= step < 0, 0 <= step <= self._gap
+        self.left_out = late or (self._follows and not in_order)
+        self.restarted = not (in_order or self.left_out)
+        self.bad_stamps += self.left_out or (step == 0 and self._follows)
+        if not late:
+            self._follows = not self.left_out
         if not self.left_out:
             self._seen_us = time
         return not self.left_out
+
+    def count_from(self, other: SampleClock) -> None:
+        """Continue with the counts of another clock."""
+        for name in ("restarts", "invalid", "bad_stamps", "interpolated", "interval", "sparse"):
+            setattr(self, name, getattr(other, name))
 
     def samples(self, values: Sequence[int]) -> list[list[int]]:
         """Add the values of the frame that `accept` has just kept; return the samples that it completes.
@@ -137,12 +170,15 @@ class SampleClock:
             return []
         if self._last is None:
             self._start, self._made, self._last = time, 1, (time, now)
+            self.interval, self.sparse = min(self._period * 256 // 1000, _MOST_INTERVAL), False
             return [now]
         before, old = self._last
         self._last = (time, now)
         made = []
+        between = time - before
+        self.interval += (min(between // 1000, 255) * 256 - self.interval) >> 4
+        self.sparse = 1000 * self.interval > 512 * self._period
         if time > before:
-            between = time - before
             due = self._start + self._made * self._period
             while due <= time:
                 into = 2 * (due - before)
@@ -153,6 +189,8 @@ class SampleClock:
                     made.append([a + ((b - a) * into + between) // twice for a, b in zip(old, now, strict=True)])
                 due += self._period
             self._made += len(made)
+        if 2 * between >= 3 * self._period:
+            self.interpolated += len(made) - 1
         return made
 
 

@@ -358,7 +358,7 @@ def test_c_that_warns_or_writes_past_its_memory(c_compiler: str, own: Path, caps
     edit(own / "plushsense.c", "toy->heard = 1;", "toy->heard = 1; int unused;")
     done = verify(Export(own), ["host"], only=plainly, trust=True)
     assert done.mismatches == sum(r.vectors for r in done.runs) and "unused" in (done.first or "")
-    edit(own / "plushsense.c", "toy->heard = 1; int unused;", "((uint32_t *)toy->memory)[-1] = 0; toy->heard = 1;")
+    edit(own / "plushsense.c", "toy->heard = 1; int unused;", "((uint32_t *)toy->held)[-1] = 0; toy->heard = 1;")
     done = verify(Export(own), ["host"], only=plainly, trust=True)
     assert "before the toy's memory" in (done.first or "") and done.mismatches >= 1
 

@@ -5,13 +5,16 @@
  * What is fed are cases, one after the other, of 32-bit little-endian numbers: the bytes of a model, and the model, filled
  * up to whole numbers (0 bytes: the export's own); then, again and again, how many frames, and each: milliseconds, then
  * the measured channels; and what comes after them: 0, the case ends; 1, a silence; 2, a patch: its bytes, and the patch,
- * filled up (0 bytes: the model's own layer is brought back). What is written are rows of the same kind:
+ * filled up (0 bytes: the model's own layer is brought back); 3, the toy is primed with a frame; 4, a sensitivity. What is
+ * written are rows of the same kind:
  *
- *     0, frame, ms, sample, state, gesture, affect, confidence, answer, known, restarts, invalid, logits x classes,
+ *     0, frame, ms, sample, state, gesture, affect, confidence, answer, known, counts, logits x classes,
  *         smooth x classes; while warming all from gesture to known is 0, and logits and smooth
- *     1, frame, ms, number, what, gesture, affect, source, since, 0, restarts, invalid, and zeros: an event
- *     2, frame, ms, faults, state, suspect, 0, 0, 0, 0, restarts, invalid, and zeros: health says something else
- *     3, frame, ms, status, 0, 0, 0, 0, 0, 0, restarts, invalid, and zeros: what plush_patch() says
+ *     1, frame, ms, number, what, gesture, affect, source, since, 0, counts, and zeros: an event
+ *     2, frame, ms, faults, state, suspect, 0, 0, 0, 0, counts, and zeros: health says something else
+ *     3, frame, ms, status, 0, 0, 0, 0, 0, 0, counts, and zeros: what plush_patch() says
+ *
+ * The counts are restarts, invalid, bad_stamps, interpolated, interval, sparse.
  *
  * When something is wrong that no row can show, one more row is written, not whole: words that say it.
  *
@@ -29,7 +32,7 @@
 
 #include <string.h>
 
-#define HEAD 12u
+#define HEAD 16u
 #define OWN_WORDS (PLUSH_HARNESS_MEMORY_BYTES / 4u)
 #define MEMORY_WORDS (PLUSH_MODEL_MEMORY_WORDS > OWN_WORDS ? PLUSH_MODEL_MEMORY_WORDS : OWN_WORDS)
 #define NUMBERS (2u * PLUSH_HARNESS_CLASSES)
@@ -37,7 +40,7 @@
 #define POISON UINT32_C(0xa5c35a3c)
 
 /* What comes after frames. */
-enum { END = 0, SILENCE = 1, PATCH = 2 };
+enum { END = 0, SILENCE = 1, PATCH = 2, PRIME = 3, SENSITIVITY = 4 };
 
 #ifdef PLUSH_HARNESS_DEVICE
 #include "plush_device.h"
@@ -149,6 +152,8 @@ static void begin_row(uint32_t kind, uint32_t ms, const uint32_t what[7])
     for (i = 0; i < 7; i++)
         to = put(to, what[i]);
     to = put(put(to, toy.restarts), toy.invalid);
+    to = put(put(to, toy.bad_stamps), toy.interpolated);
+    to = put(put(to, toy.interval), toy.sparse);
     memset(to, 0, 4u * NUMBERS);
 }
 
@@ -230,6 +235,8 @@ static int status_words(plush_status status)
         return wrong("plush_begin() says PLUSH_MEMORY_TOO_SMALL.");
     case PLUSH_NOT_ALIGNED:
         return wrong("plush_begin() says PLUSH_NOT_ALIGNED.");
+    case PLUSH_MEMORY_NOT_ALIGNED:
+        return wrong("plush_begin() says PLUSH_MEMORY_NOT_ALIGNED.");
     default:
         return wrong("plush_begin() says something that it cannot say.");
     }
@@ -257,18 +264,29 @@ static void on_patch(uint32_t ms)
     end_row();
 }
 
-static int push_next(uint32_t *ms, uint32_t *due)
+/* The next frame of the case; NULL when it did not come. */
+static const int32_t *next_frame(uint32_t *ms)
 {
     static int32_t values[PLUSH_HARNESS_CHANNELS];
     const uint8_t *p = plush_device_bytes(4u * (1u + PLUSH_HARNESS_CHANNELS), 0);
-    int fault = toy.answer.state == PLUSH_FAULT, suspect = toy.suspect, tracking = toy.answer.state == PLUSH_TRACKING;
-    uint32_t i, n, from;
+    uint32_t i;
 
     if (p == NULL)
-        return 0;
+        return NULL;
     *ms = number(p);
     for (i = 0; i < PLUSH_HARNESS_CHANNELS; i++)
         values[i] = signed_number(p + 4u + 4u * i);
+    return values;
+}
+
+static int push_next(uint32_t *ms, uint32_t *due)
+{
+    const int32_t *values = next_frame(ms);
+    int fault = toy.answer.state == PLUSH_FAULT, suspect = toy.suspect, tracking = toy.answer.state == PLUSH_TRACKING;
+    uint32_t n, from;
+
+    if (values == NULL)
+        return 0;
     apart = 0;
     from = plush_device_cycles();
     n = plush_push(&toy, *ms, values);
@@ -283,6 +301,17 @@ static int push_next(uint32_t *ms, uint32_t *due)
     if (fault != (toy.answer.state == PLUSH_FAULT) || suspect != toy.suspect)
         on_health(*ms);
     return 1;
+}
+
+/* Returns how many answers fell due. */
+static uint32_t on_prime(void)
+{
+    uint32_t ms, before = toy.answers;
+    const int32_t *values = next_frame(&ms);
+
+    if (values != NULL)
+        plush_prime(&toy, ms, values);
+    return toy.answers - before;
 }
 
 /* The frames of a case, and what comes between them. Says whether all came, and all answers were told. */
@@ -301,6 +330,10 @@ static int feed(void)
             plush_silence(&toy);
         else if (what == PATCH)
             on_patch(ms);
+        else if (what == PRIME)
+            due += on_prime();
+        else if (what == SENSITIVITY)
+            toy.sensitivity = (int8_t)((int32_t)((next_number() + 128u) & 255u) - 128);
         frame++;
     } while (what != END);
     return (due == answers && toy.answers == answers) ||

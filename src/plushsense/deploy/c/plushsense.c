@@ -45,8 +45,10 @@
 
 /* What a model may ask for, so that every sum, size and address below is sure to fit. */
 #define MOST_UNITS (UINT32_C(1) << 22) /* of the clock's gap and period: see part_of() */
+#define MOST_UNITS_PER_MS 1000u
+#define MOST_BRIDGED 1000u             /* samples in a gap, as nobody can wait longer for plush_push() */
 #define MOST_STEP 257u                 /* 257 x 255 is the most that 16 bits hold */
-#define MOST_ROWS 65535u
+#define MOST_ROWS 65531u /* and SPARE more */
 #define MOST_FILTERS 4096u
 #define MOST_SHIFT 30u
 #define MOST_INPUT_SHIFT 16u
@@ -111,6 +113,8 @@ enum { BASELINE, NOISE, SIZE, SIGNAL_WORDS };
 /* How a class is told: its affect, and whether it is idle. */
 #define TOLD_AFFECT 3u
 #define TOLD_IDLE 4u
+
+#define KEPT_BYTES offsetof(plush_toy, layers) /* of a toy, when its model is another one */
 
 struct plush_aligned {
     uint8_t byte;
@@ -391,7 +395,8 @@ PLUSH_SMALL static int read_head(plush_toy *toy, source *from)
     toy->ranges = next_bytes(from, RANGE_BYTES * toy->channels);
     if (toy->layers == 0 || toy->layers > PLUSH_MAX_LAYERS || toy->channels == 0 || toy->inputs == 0 ||
         toy->classes == 0 || toy->step == 0 || toy->step > MOST_STEP || toy->blocks == 0 || toy->period == 0 ||
-        toy->period > MOST_UNITS || toy->gap == 0 || toy->gap > MOST_UNITS || toy->units_per_ms == 0 ||
+        toy->period > MOST_UNITS || toy->gap == 0 || toy->gap > MOST_UNITS || toy->gap / toy->period > MOST_BRIDGED ||
+        toy->units_per_ms == 0 || toy->units_per_ms > MOST_UNITS_PER_MS ||
         toy->smoothing == 0 || toy->smoothing > PLUSH_ONE || toy->ranges == NULL)
         return 0;
     toy->narrow = (UINT32_MAX - toy->gap) / (2 * toy->gap);
@@ -536,12 +541,10 @@ PLUSH_SMALL static int read_dense_and_names(plush_toy *toy, source *from)
     toy->classes_told = next_bytes(from, toy->classes);
     if (toy->dense == NULL || toy->dense_weights == NULL || toy->classes_told == NULL)
         return 0;
-    toy->names = from->at;
     for (i = 0; i < toy->classes; i++)
         if (toy->classes_told[i] > (TOLD_IDLE | TOLD_AFFECT) || next_text(from) == NULL)
             return 0;
-    toy->title = next_text(from);
-    return toy->title != NULL;
+    return next_text(from) != NULL;
 }
 
 PLUSH_SMALL static int read_event_plan(plush_toy *toy, source *from)
@@ -715,7 +718,6 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
     }
     toy->valid = (uint8_t *)take(memory, &used, toy->channels);
     toy->top = (uint8_t *)take(memory, &used, 2u * toy->features);
-    toy->memory_bytes = used; /* what a restart forgets: health has its own rules */
     toy->last = (int32_t *)take(memory, &used, last_matters(toy) ? 4u * toy->channels : 0);
     share_sensors(toy, memory, &used);
     return used;
@@ -1194,6 +1196,15 @@ static uint32_t setting(const plush_toy *toy, uint32_t which)
     return le16(toy->event_plan + which);
 }
 
+/* A probability that an event asks for: 1/512 less for each step of the sensitivity. Settings above 1 are never reached. */
+PLUSH_APART
+static int32_t least_share(const plush_toy *toy, uint32_t which)
+{
+    int32_t trained = (int32_t)setting(toy, which);
+
+    return trained > PLUSH_ONE ? trained : trained - toy->sensitivity * 64;
+}
+
 /* No setting asks for more than 16 bits can count. */
 PLUSH_CODE
 static void count_up(uint16_t *count)
@@ -1246,6 +1257,7 @@ static int going_on(const plush_toy *toy)
     return toy->event.what == PLUSH_BEGUN || toy->event.what == PLUSH_NAMED;
 }
 
+PLUSH_CODE
 static void tell(plush_toy *toy, plush_what what, uint32_t since, uint32_t ms)
 {
     toy->event.what = what;
@@ -1322,7 +1334,7 @@ static uint32_t affect_alone(const plush_toy *toy)
             affect = other;
         }
     }
-    return most >= setting(toy, ENTER_AFFECT) ? affect : 0u;
+    return (int32_t)most >= least_share(toy, ENTER_AFFECT) ? affect : 0u;
 }
 
 /* How many steps in a row the same was wanted. */
@@ -1360,6 +1372,7 @@ static void closed_step(plush_toy *toy, uint32_t said, uint32_t affect, uint32_t
 }
 
 /* Whether something else than the event was wanted for long enough to take its place. */
+PLUSH_APART
 static int another(const plush_toy *toy, uint32_t said, uint32_t affect)
 {
     const plush_event *event = &toy->event;
@@ -1381,9 +1394,9 @@ static int stays(const plush_toy *toy, uint32_t best)
     if (is_idle(toy, best) && share_of(toy, best) >= setting(toy, ENTER))
         return 0;
     if (event->gesture != PLUSH_NO_GESTURE)
-        return share_of(toy, event->gesture) >= setting(toy, LEAVE);
+        return (int32_t)share_of(toy, event->gesture) >= least_share(toy, LEAVE);
     /* Begun by the gate, it may have nothing to be recognised by. */
-    return event->affect != PLUSH_AFFECT_NONE && mass_of(toy, event->affect) >= setting(toy, LEAVE_AFFECT);
+    return event->affect != PLUSH_AFFECT_NONE && (int32_t)mass_of(toy, event->affect) >= least_share(toy, LEAVE_AFFECT);
 }
 
 static void open_step(plush_toy *toy, uint32_t best, uint32_t said, uint32_t affect, uint32_t ms)
@@ -1421,7 +1434,7 @@ static void event_step(plush_toy *toy, uint32_t best, uint32_t ms)
     if (!toy->suspect) {
         if (toy->answer.kind == PLUSH_UNKNOWN || toy->answer.kind == PLUSH_IDLE) {
             /* nothing is wanted */
-        } else if (toy->answer.confidence >= setting(toy, ENTER)) {
+        } else if (toy->answer.confidence >= least_share(toy, ENTER)) {
             said = best;
             affect = affect_of(toy, best);
         } else {
@@ -1665,6 +1678,7 @@ static int examine(plush_toy *toy, uint32_t ms, const int32_t *values)
 /* ---- Samples and frames ---------------------------------------------------------------------------------------- */
 
 /* A channel of the even sample, from its zero. */
+PLUSH_CODE
 static int32_t from_zero(const plush_toy *toy, uint32_t channel)
 {
     return as_signed((uint32_t)toy->sample[channel] - le32(toy->ranges + RANGE_BYTES * channel + 8));
@@ -1687,7 +1701,7 @@ static int32_t follow_mean(const plush_toy *toy, int32_t *mean, int32_t x, uint3
 }
 
 /* One more sample, up to 2^15; `mean_shift` is the binary logarithm of their number. */
-static void count_means(plush_toy *toy)
+PLUSH_SMALL PLUSH_CODE static void count_means(plush_toy *toy)
 {
     if (toy->mean_samples >> MOST_MEAN_SHIFT != 0)
         return;
@@ -1936,7 +1950,7 @@ PLUSH_SMALL static void forget(plush_toy *toy)
 {
     uint32_t phase;
 
-    memset(toy->memory, 0, (size_t)toy->memory_bytes);
+    memset(toy->held, 0, (size_t)((uint8_t *)toy->last - (uint8_t *)toy->held));
     toy->waiting = 0;
     toy->heard = toy->running = 0;
     toy->block = toy->gate_deaf = 0;
@@ -1956,14 +1970,15 @@ PLUSH_SMALL static void forget(plush_toy *toy)
 PLUSH_SMALL_APART
 static plush_status prepare(plush_toy *toy, const uint8_t *model, void *memory, uint32_t memory_bytes)
 {
-    memset(toy, 0, sizeof *toy);
+    memset((uint8_t *)toy + KEPT_BYTES, 0, sizeof *toy - KEPT_BYTES);
     if ((uintptr_t)model % GROUP != 0)
         return PLUSH_NOT_ALIGNED;
     if (!read_model(toy, model))
         return PLUSH_DAMAGED;
-    if (memory == NULL || !is_aligned(memory) || share_out(toy, NULL) > memory_bytes)
+    if (!is_aligned(memory))
+        return PLUSH_MEMORY_NOT_ALIGNED;
+    if (memory == NULL || share_out(toy, NULL) > memory_bytes)
         return PLUSH_MEMORY_TOO_SMALL;
-    toy->memory = memory;
     share_out(toy, (uint8_t *)memory);
     return PLUSH_OK;
 }
@@ -1986,27 +2001,36 @@ PLUSH_SMALL uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_byt
 PLUSH_APART
 void plush_restart(plush_toy *toy)
 {
-    if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
+    if (toy->held == NULL) /* plush_begin() has not said PLUSH_OK */
         return;
     lose(toy, toy->seen_ms);
     forget_health(toy);
     forget(toy);
     toy->follows = 0;
+    toy->seen_ms = 0;
 }
 
 PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes)
 {
-    plush_status status = check(model, model_bytes, "PLSH");
+    plush_status status;
 
+    if (toy->self != toy)
+        memset(toy, 0, sizeof *toy);
+    else if (going_on(toy)) /* nothing here reads the old model or memory, which may be gone */
+        tell(toy, PLUSH_ENDED, toy->seen_ms, toy->seen_ms);
+    memset(toy, 0, offsetof(plush_toy, on_answer));
+    status = check(model, model_bytes, "PLSH");
     if (status == PLUSH_OK)
         status = prepare(toy, model, memory, memory_bytes);
-    if (status != PLUSH_OK)
+    if (status != PLUSH_OK) {
         memset(toy, 0, sizeof *toy);
-    else
-        begin_sensors(toy);
+        return status;
+    }
+    toy->self = toy;
+    begin_sensors(toy);
     plush_restart(toy);
-    return status;
+    return PLUSH_OK;
 }
 
 PLUSH_SMALL_APART
@@ -2017,10 +2041,10 @@ static plush_status take_over(plush_toy *toy, const uint8_t *model, void *memory
 
     if (status != PLUSH_OK)
         return status;
-    if (toy->memory == NULL || toy->layout != next.layout || toy->channels != next.channels)
+    if (toy->held == NULL || toy->layout != next.layout || toy->channels != next.channels)
         return PLUSH_OTHER_LAYOUT;
     lose(toy, toy->seen_ms); /* while the old model can still be read */
-    memcpy(&next, toy, offsetof(plush_toy, layers)); /* answers, events, counts, callbacks */
+    memcpy(&next, toy, KEPT_BYTES);
     *toy = next;
     begin_sensors(toy);
     plush_restart(toy);
@@ -2037,7 +2061,7 @@ PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32
 
 PLUSH_SMALL uint32_t plush_model_id(const plush_toy *toy)
 {
-    return toy->memory != NULL ? word_at(toy->ranges - SHAPE_BYTES - 4) : 0;
+    return toy->held != NULL ? word_at(toy->ranges - SHAPE_BYTES - 4) : 0;
 }
 
 PLUSH_SMALL plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_bytes)
@@ -2045,7 +2069,7 @@ PLUSH_SMALL plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint3
     uint32_t scales = SCALE_BYTES * toy->classes, weights = (uint32_t)toy->classes * toy->features;
     const uint8_t *layer;
 
-    if (toy->memory == NULL)
+    if (toy->held == NULL)
         return PLUSH_OTHER_MODEL;
     layer = toy->classes_told - weights - scales; /* what stands before them in the model */
     if (patch != NULL) {
@@ -2070,24 +2094,49 @@ PLUSH_SMALL plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint3
 
 void plush_silence(plush_toy *toy)
 {
-    if (toy->memory != NULL)
+    if (toy->held != NULL)
         lose(toy, toy->seen_ms);
 }
 
-PLUSH_CODE
-uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
+/* Samples begin with the values that are held, at this time. */
+static void begin_samples(plush_toy *toy, uint32_t ms)
 {
-    uint32_t between, due = 0;
+    uint32_t usual = toy->period * 256 / toy->units_per_ms;
 
-    if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
-        return 0;
-    if (ms < toy->seen_ms || ms - toy->seen_ms > toy->gap / toy->units_per_ms) {
-        if (toy->follows) { /* only if the next one is out of order, too, the clock is right */
-            toy->follows = 0;
-            toy->reading = PLUSH_READING_LEFT_OUT;
-            return 0;
-        }
-        lose(toy, toy->seen_ms);
+    toy->running = 1;
+    toy->last_ms = ms;
+    toy->due = toy->period;
+    toy->interval = (uint16_t)(usual < UINT16_MAX ? usual : UINT16_MAX);
+    toy->sparse = 0;
+    memcpy(toy->sample, toy->held, 4u * toy->channels);
+}
+
+/* One more reading, so long after the last one that was used. */
+static void follow_interval(plush_toy *toy, uint32_t ms)
+{
+    int32_t now = (int32_t)(ms < 255 ? ms : 255) * 256;
+
+    toy->interval = (uint16_t)(toy->interval + shift_down(now - toy->interval, 4));
+    toy->sparse = toy->interval * toy->units_per_ms > 512 * toy->period;
+}
+
+/* Whether a reading is left out: its time is before that of the one before by no more than the gap; or it is out of order,
+ * and the one before was not: if the next one is, too, the clock is right. */
+static int leaves_out(plush_toy *toy, uint32_t ms)
+{
+    uint32_t gap_ms = toy->gap / toy->units_per_ms, seen = toy->seen_ms;
+    int early = ms < seen && seen - ms <= gap_ms;
+
+    if (ms >= seen && ms - seen <= gap_ms) {
+        if (ms == seen && toy->follows)
+            toy->bad_stamps++;
+    } else if (early || toy->follows) {
+        toy->follows &= (uint8_t)early;
+        toy->bad_stamps++;
+        toy->reading = PLUSH_READING_LEFT_OUT;
+        return 1;
+    } else {
+        lose(toy, seen);
         forget_health(toy);
         if (toy->heard) { /* not in a fault, nor with the very first frame */
             toy->restarts++;
@@ -2095,6 +2144,16 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
         }
     }
     toy->follows = 1;
+    return 0;
+}
+
+PLUSH_CODE
+uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
+{
+    uint32_t between, due = 0;
+
+    if (toy->held == NULL || leaves_out(toy, ms)) /* plush_begin() has not said PLUSH_OK */
+        return 0;
     toy->seen_ms = ms;
     if (examine(toy, ms, values)) {
         if (toy->faulty)
@@ -2113,13 +2172,13 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
     toy->reading = PLUSH_READING_USED;
     if (!toy->running) {
         toy->reading = PLUSH_READING_FIRST;
-        toy->running = 1;
-        toy->last_ms = ms;
-        toy->due = toy->period;
-        memcpy(toy->sample, toy->held, 4u * toy->channels);
+        begin_samples(toy, ms);
         return push_sample(toy, ms);
     }
+    follow_interval(toy, ms - toy->last_ms);
     between = (ms - toy->last_ms) * toy->units_per_ms;
+    if (2 * between >= 3 * toy->period) /* all samples but the last */
+        toy->interpolated += (between - toy->due) / toy->period;
     while (toy->due <= between) { /* never for an equal stamp: a sample at the last frame's time is already made */
         interpolate(toy, toy->due, between);
         due += push_sample(toy, toy->last_ms + toy->due / toy->units_per_ms);
@@ -2130,19 +2189,56 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
     return due;
 }
 
-const char *plush_gesture_name(const plush_toy *toy, uint8_t gesture)
+PLUSH_SMALL uint32_t plush_push_many(plush_toy *toy, const int32_t *frames, uint32_t n, uint32_t last_ms, uint32_t period_us)
 {
-    const uint8_t *p = toy->names;
+    uint32_t due = 0;
 
-    if (gesture >= toy->classes)
-        return "";
-    for (; gesture > 0; gesture--)
+    for (; n > 0; frames += toy->channels) {
+        uint32_t early_ms = (--n * period_us + 999) / 1000;
+
+        if (early_ms <= last_ms)
+            due += plush_push(toy, last_ms - early_ms, frames);
+    }
+    return due;
+}
+
+PLUSH_SMALL int plush_prime(plush_toy *toy, uint32_t ms, const int32_t *values)
+{
+    plush_restart(toy);
+    toy->seen_ms = ms;
+    plush_push(toy, ms, values);
+    if (toy->reading != PLUSH_READING_FIRST)
+        return 0;
+    while (toy->warm + toy->step < toy->span) {
+        memcpy(toy->sample, toy->held, 4u * toy->channels); /* calibrating has changed it */
+        push_sample(toy, ms);
+    }
+    return 1;
+}
+
+PLUSH_SMALL uint8_t plush_probability(const plush_toy *toy, uint8_t gesture)
+{
+    return (uint8_t)(gesture < toy->classes ? share_of(toy, gesture) * 255 / PLUSH_ONE : 0u);
+}
+
+/* The label of a class, or the title, which stands after them. */
+PLUSH_SMALL_APART
+static const char *text_of(const plush_toy *toy, uint32_t n)
+{
+    const uint8_t *p = toy->classes_told + toy->classes;
+
+    for (; n > 0; n--)
         while (*p++ != 0) {
         }
     return (const char *)p;
 }
 
-const char *plush_model_title(const plush_toy *toy)
+PLUSH_SMALL const char *plush_gesture_name(const plush_toy *toy, uint8_t gesture)
 {
-    return toy->memory != NULL ? (const char *)toy->title : "";
+    return gesture < toy->classes ? text_of(toy, gesture) : "";
+}
+
+PLUSH_SMALL const char *plush_model_title(const plush_toy *toy)
+{
+    return toy->held != NULL ? text_of(toy, toy->classes) : "";
 }

@@ -21,6 +21,7 @@ from plushsense.deploy.golden import (
     COLUMNS,
     HEAD,
     TRACKING,
+    Call,
     FrameGenerator,
     Vectors,
     answers_of,
@@ -134,13 +135,13 @@ def patches_of(model: IntegerModel, scaler: Scaler) -> Vectors:
 def _scenario(plain: IntegerModel, scaler: Scaler, settings: _ScenarioSettings, seed: int) -> Vectors:
     rng = np.random.default_rng(seed)
     health = _health(plain, scaler, rng)
-    frames, silences = (_troubled if settings.gate else _calm)(plain, scaler, health, rng)
+    frames, calls = (_troubled if settings.gate else _calm)(plain, scaler, health, rng)
     level = _NormalizedModel(plain, _logits(answers_of(plain, frames)))
     gate = _gate(plain, frames, settings.often, rng) if settings.gate else GateSettings()
     rules = Rules(_events(level, settings, rng), gate, health)
     model = replace(level.model, smoothing=settings.smoothing, rules=rules)
-    answers = answers_of(model, frames, silences)
-    return Vectors("scenario", frames, answers, samples_of(frames, model.layout), model, silences)
+    answers = answers_of(model, frames, calls)
+    return Vectors("scenario", frames, answers, samples_of(frames, model.layout), model, calls)
 
 
 def _logits(rows: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -225,22 +226,22 @@ def _health(model: IntegerModel, scaler: Scaler, rng: np.random.Generator) -> He
 
 def _troubled(
     model: IntegerModel, scaler: Scaler, health: HealthSettings, rng: np.random.Generator
-) -> tuple[Ints, tuple[int, ...]]:
-    """Generate frames with impacts and failing sensors, also during warm-up; return them and the silences."""
+) -> tuple[Ints, tuple[Call, ...]]:
+    """Generate frames with impacts and failing sensors, also during warm-up; return them and the calls."""
     layout, span = model.layout, model.network.arch.span
-    generator, silences = FrameGenerator(layout, scaler, rng), []
+    generator, calls = FrameGenerator(layout, scaler, rng), list[Call]()
     part = span + 400
     generator.touches(part, blows=0.02, garbage=0.05 / len(generator.mean))
     for _ in range(4):
         generator.touches(int(rng.integers(20, 60)), blows=0.05)
-        silences.append(len(generator.rows) - 1)
+        calls.append(Call(len(generator.rows) - 1, "silence"))
     generator.touches(200, lost=0.03, blows=0.02)
     generator.strays()
     for n in range(40):
         generator.touches(7)
         generator.frozen(4)
         if n % 2:  # otherwise the gate only prolongs its event
-            silences.append(len(generator.rows) - 1)
+            calls.append(Call(len(generator.rows) - 1, "silence"))
     for _ in range(3):
         generator.touches(30, blows=0.2)
         generator.wait(layout.gap_ms + 1)
@@ -248,19 +249,27 @@ def _troubled(
     generator.troubles(health, span + 250)
     generator.now = 7
     generator.touches(part, garbage=0.15 / len(generator.mean), blows=0.02)
-    return np.array(generator.rows, dtype=np.int64), tuple(silences)
+    return np.array(generator.rows, dtype=np.int64), tuple(calls)
 
 
 def _calm(
     model: IntegerModel, scaler: Scaler, health: HealthSettings, rng: np.random.Generator
-) -> tuple[Ints, tuple[int, ...]]:
-    """Generate frames with long touches and some suspect frames; return them and the silences."""
-    generator, silences = FrameGenerator(model.layout, scaler, rng), []
+) -> tuple[Ints, tuple[Call, ...]]:
+    """Generate frames with long touches and some suspect frames; return them and the calls."""
+    generator, calls = FrameGenerator(model.layout, scaler, rng), list[Call]()
     generator.touches(model.network.arch.span)
     for n in range(24):
-        generator.touches(170, garbage=(0.08 if n % 2 else 0.01) / len(generator.mean))
-        silences.append(len(generator.rows) - 1)
-    return np.array(generator.rows, dtype=np.int64), tuple(silences)
+        generator.touches(80, garbage=(0.08 if n % 2 else 0.01) / len(generator.mean))
+        # A silence, or another sensitivity; now and then the toy was asleep and is primed.
+        calls.append(Call(len(generator.rows) - 1, "silence"))
+        generator.touches(1)
+        calls.append(Call(len(generator.rows) - 1, "sensitivity", int(rng.integers(-128, 128)) if n % 3 else 0))
+        generator.touches(90)
+        if n % 8 == 7:
+            generator.wait(2 * model.layout.gap_ms)
+            generator.touches(1)
+            calls.append(Call(len(generator.rows) - 1, "prime"))
+    return np.array(generator.rows, dtype=np.int64), tuple(calls)
 
 
 def _gate(model: IntegerModel, frames: Ints, often: bool, rng: np.random.Generator) -> GateSettings:

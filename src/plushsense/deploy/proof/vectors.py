@@ -291,7 +291,7 @@ class RowComparison:
 
 
 def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> RowComparison:
-    """Compare the output of the test program with the expected rows (m, 12 + 2 K)."""
+    """Compare the output of the test program with the expected rows (m, 16 + 2 K)."""
     width = expected.shape[1]
     n_rows = len(got) // (4 * width)
     rows = np.frombuffer(got[: n_rows * 4 * width], dtype="<i4").reshape(n_rows, width).astype(np.int64)
