@@ -21,6 +21,7 @@
 #define LOGIT_LIMIT 16384
 #define SPARE 4u            /* rows for new samples, before those under the taps move */
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
+#define MIDDLE (UINT32_C(1) << 23) /* beyond every sum of a convolution */
 
 /* Not copied to where it is called: for the registers of a loop, or for the flash. */
 #if defined(__GNUC__)
@@ -721,162 +722,80 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 
 /* ---- What differs from core to core ----------------------------------------------------------------------------- */
 
-/* Three ways to the same numbers: instructions for several bytes at once where a core has them, otherwise plain C.
- * PLUSH_PLAIN asks for plain C everywhere.
+/* Four sums of at most 24 bits each are found by three multiplications of 32 bits instead of four. With the weights
+ * u0 to u3 (+ 128) of four filters for one channel in a word v, lowest first, and modulo 2^32, the sums over all channels
  *
- *     PLUSH_ALONE            the next 4 activations at `x`, times the weights (with 128 added) of 4 filters at `w`
- *     PLUSH_PAIR             the same of 2 filters, at `x` and at `y`: a weight is loaded once for two positions. Not
- *                            where it takes longer.
+ *     of activation * v                       are  a = S0 + 2^8 S1 + 2^16 S2 + 2^24 S3
+ *     of activation * (v >> 16)               are  b = S2 + 2^8 S3
+ *     of activation * ((v >> 8) & 0xffff)     are  c = S1 + 2^8 S2
+ *
+ * and a - 2^8 c has S0 in its low 24 bits, from which the others follow: see outputs().
+ *
  *     PLUSH_SUM_BYTES(s, v)  the four bytes of a word, into `s`
  *     PLUSH_LIMIT(v, bits)   a number below 2^31, at most the highest of so many bits
  */
-#if defined(__GNUC__) && defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && !defined(PLUSH_PLAIN)
+#if defined(__GNUC__) && defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
+/* le32() of what lies at a multiple of 4. */
+static uint32_t aligned_le32(const uint8_t *p)
+{
+    uint32_t v;
 
-#define PLUSH_DSP
-#define PLUSH_SUM_BYTES(s, v) __asm__("usada8 %0, %1, %2, %0" : "+r"(s) : "r"(v), "r"(0))
-#define PLUSH_LIMIT(v, bits) __asm__("usat %0, %1, %0" : "+r"(v) : "i"(bits))
-
-/* Two halves in a register: activations of channels 0 and 2 in `a`, 1 and 3 in `b`; weights of one filter in `c` and `d`,
- * of the next in `e` and `f`. */
-#define PLUSH_SPLIT(even, odd) "uxtb16 " odd ", " even ", ror #8\n\tuxtb16 " even ", " even "\n\t"
-#define PLUSH_ACTIVATIONS "ldr %[a], [%[x]], #4\n\t" PLUSH_SPLIT("%[a]", "%[b]")
-#define PLUSH_WEIGHTS(step) \
-    "ldrd %[c], %[e], [%[w]], #" step "\n\t" PLUSH_SPLIT("%[c]", "%[d]") PLUSH_SPLIT("%[e]", "%[f]")
-#define PLUSH_PRODUCTS                                                   \
-    "smlad %[s], %[a], %[c], %[s]\n\tsmlad %[t], %[a], %[e], %[t]\n\t"   \
-    "smlad %[s], %[b], %[d], %[s]\n\tsmlad %[t], %[b], %[f], %[t]"
-#define PLUSH_TWO_FILTERS(first, second)                                                                   \
-    __asm__ volatile(PLUSH_WEIGHTS("8") PLUSH_PRODUCTS                                                     \
-                     : [w] "+&r"(w), [s] "+&r"(first), [t] "+&r"(second), [c] "=&r"(c), [d] "=&r"(d),        \
-                       [e] "=&r"(e), [f] "=&r"(f)                                                          \
-                     : [a] "r"(a), [b] "r"(b)                                                              \
-                     : "memory")
-#define PLUSH_ALONE                                                                                        \
-    do {                                                                                                   \
-        uint32_t a, b, c, d, e, f;                                                                         \
-        __asm__ volatile(PLUSH_ACTIVATIONS : [x] "+&r"(x), [a] "=&r"(a), [b] "=&r"(b) : : "memory");       \
-        PLUSH_TWO_FILTERS(s0, s1);                                                                         \
-        PLUSH_TWO_FILTERS(s2, s3);                                                                         \
-    } while (0)
-#define PLUSH_PAIR                                                                                         \
-    do {                                                                                                   \
-        uint32_t a, b, c, d, e, f;                                                                         \
-        __asm__ volatile(PLUSH_WEIGHTS("16") PLUSH_ACTIVATIONS PLUSH_PRODUCTS                              \
-                         : [x] "+&r"(x), [w] "+&r"(w), [s] "+&r"(s0), [t] "+&r"(s1), [a] "=&r"(a),         \
-                           [b] "=&r"(b), [c] "=&r"(c), [d] "=&r"(d), [e] "=&r"(e), [f] "=&r"(f)            \
-                         :                                                                                 \
-                         : "memory");                                                                      \
-        __asm__ volatile(PLUSH_ACTIVATIONS PLUSH_PRODUCTS                                                  \
-                         : [x] "+&r"(y), [s] "+&r"(t0), [t] "+&r"(t1), [a] "=&r"(a), [b] "=&r"(b)          \
-                         : [c] "r"(c), [d] "r"(d), [e] "r"(e), [f] "r"(f)                                  \
-                         : "memory");                                                                      \
-    } while (0)
-
-#elif defined(__SSE2__) && !defined(PLUSH_PLAIN)
-
-#include <emmintrin.h>
-
-/* Every product of 8 x 8 bits fits 16; each sum is kept as two halves, of channels 0 and 1 and of 2 and 3. */
-#define PLUSH_SUMS __m128i zero = _mm_setzero_si128(), s01 = zero, s23 = zero
-#define PLUSH_ALONE                                                                      \
-    do {                                                                                 \
-        int32_t four;                                                                    \
-        __m128i a, b = _mm_loadu_si128((const __m128i *)(const void *)w);                \
-        memcpy(&four, x, 4);                                                             \
-        a = _mm_unpacklo_epi8(_mm_shuffle_epi32(_mm_cvtsi32_si128(four), 0), zero);      \
-        s01 = _mm_add_epi32(s01, _mm_madd_epi16(a, _mm_unpacklo_epi8(b, zero)));         \
-        s23 = _mm_add_epi32(s23, _mm_madd_epi16(a, _mm_unpackhi_epi8(b, zero)));         \
-        x += 4;                                                                          \
-        w += 16;                                                                         \
-    } while (0)
-#define PLUSH_GIVE                                     \
-    do {                                               \
-        uint32_t halves[8], n;                         \
-        memcpy(halves, &s01, sizeof s01);              \
-        memcpy(halves + 4, &s23, sizeof s23);          \
-        for (n = 0; n < GROUP; n++)                    \
-            sum[n] = halves[2 * n] + halves[2 * n + 1]; \
-    } while (0)
-
+    __builtin_memcpy(&v, __builtin_assume_aligned(p, 4), sizeof v);
+    return v;
+}
 #else
+#define aligned_le32 le32
+#endif
 
 /* Keeps a value in a register, and what is done to it in the written order: otherwise compilers add products up in trees,
  * for which small cores have too few registers. */
 #if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
+/* The sums are in the high registers, which know additions only. */
+#define PLUSH_ADD(s, v) __asm__ volatile("add %0, %1" : "+h"(s) : "l"(v))
 #elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
 #else
 #define PLUSH_KEEP(v) ((void)0)
 #endif
+#ifndef PLUSH_ADD
 #define PLUSH_ADD(s, v) \
     do {                \
         (s) += (v);     \
         PLUSH_KEEP(s);  \
     } while (0)
-#define PLUSH_CHANNEL(i)                \
-    do {                                \
-        uint32_t a = x[i];              \
-        PLUSH_ADD(s0, a * w[i]);        \
-        PLUSH_ADD(s1, a * w[4 + (i)]);  \
-        PLUSH_ADD(s2, a * w[8 + (i)]);  \
-        PLUSH_ADD(s3, a * w[12 + (i)]); \
-    } while (0)
-#define PLUSH_ALONE       \
-    do {                  \
-        PLUSH_CHANNEL(0); \
-        PLUSH_CHANNEL(1); \
-        PLUSH_CHANNEL(2); \
-        PLUSH_CHANNEL(3); \
-        x += 4;           \
-        w += 16;          \
-    } while (0)
-#if !defined(__thumb__) || defined(__thumb2__)
-/* Four loads, then two products, then two sums: in a pipeline, what was loaded or multiplied is there one or two cycles
- * later. */
-#define PLUSH_PRODUCTS(s, t, v)            \
-    do {                                   \
-        uint32_t p = (v) * a, q = (v) * b; \
-        PLUSH_KEEP(p);                     \
-        PLUSH_KEEP(q);                     \
-        PLUSH_ADD(s, p);                   \
-        PLUSH_ADD(t, q);                   \
-    } while (0)
-#define PLUSH_CHANNEL_OF_PAIR(i)                              \
-    do {                                                      \
-        uint32_t a = x[i], b = y[i], c = w[i], d = w[4 + (i)]; \
-        PLUSH_KEEP(a);                                        \
-        PLUSH_KEEP(b);                                        \
-        PLUSH_KEEP(c);                                        \
-        PLUSH_KEEP(d);                                        \
-        PLUSH_PRODUCTS(s0, t0, c);                            \
-        PLUSH_PRODUCTS(s1, t1, d);                            \
-    } while (0)
-#define PLUSH_PAIR                \
-    do {                          \
-        PLUSH_CHANNEL_OF_PAIR(0); \
-        PLUSH_CHANNEL_OF_PAIR(1); \
-        PLUSH_CHANNEL_OF_PAIR(2); \
-        PLUSH_CHANNEL_OF_PAIR(3); \
-        x += 4;                   \
-        y += 4;                   \
-        w += 16;                  \
-    } while (0)
 #endif
 
-#endif
-
-#ifndef PLUSH_SUMS
-#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0
-#define PLUSH_GIVE   \
-    do {             \
-        sum[0] = s0; \
-        sum[1] = s1; \
-        sum[2] = s2; \
-        sum[3] = s3; \
+#define PLUSH_CHANNEL(i, at)                       \
+    do {                                           \
+        uint32_t v = aligned_le32(w + (at)), a = x[i], p; \
+        p = v * a;                                 \
+        PLUSH_ADD(s0, p);                          \
+        p = (v >> 16) * a;                         \
+        PLUSH_ADD(s1, p);                          \
+        p = (v >> 8 & 0xffffu) * a;                \
+        PLUSH_ADD(s2, p);                          \
     } while (0)
-#endif
-#ifndef PLUSH_DSP
+#define PLUSH_CHANNEL_OF_PAIR(i, at)               \
+    do {                                           \
+        uint32_t v = aligned_le32(w + (at)), a = x[i], b = y[i], u, p; \
+        u = v >> 16;                               \
+        p = u * a;                                 \
+        PLUSH_ADD(s1, p);                          \
+        p = u * b;                                 \
+        PLUSH_ADD(t1, p);                          \
+        u = v >> 8 & 0xffffu;                      \
+        p = u * a;                                 \
+        PLUSH_ADD(s2, p);                          \
+        p = u * b;                                 \
+        PLUSH_ADD(t2, p);                          \
+        p = v * a;                                 \
+        PLUSH_ADD(s0, p);                          \
+        p = v * b;                                 \
+        PLUSH_ADD(t0, p);                          \
+    } while (0)
+#ifdef PLUSH_DSP
+#else
 #define PLUSH_SUM_BYTES(s, v)                                                      \
     do {                                                                           \
         uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
@@ -947,61 +866,46 @@ static uint32_t surplus(plush_layer *layer, uint32_t back)
     return sum * WEIGHT_ZERO;
 }
 
-/* The sums of four filters at one position, of activations times (weight + 128), modulo 2^32. By itself, so that its loop
- * has all registers. */
+/* The three sums of four filters at one position. By itself, so that its loop has all registers. */
 PLUSH_APART
-static void four_sums(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[GROUP])
+static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[3])
 {
-    PLUSH_SUMS;
+    uint32_t s0 = 0, s1 = 0, s2 = 0;
 
-#ifdef PLUSH_DSP /* elsewhere a second copy takes more bytes than it is worth */
-    if (((end - x) & 4) != 0)
-        PLUSH_ALONE;
-    while (x != end) {
-        PLUSH_ALONE;
-        PLUSH_ALONE;
-    }
-#endif
-#ifndef PLUSH_DSP
-    do
-        PLUSH_ALONE;
-    while (x != end);
-#endif
-    PLUSH_GIVE;
-}
-
-#ifdef PLUSH_PAIR
-/* The same of two filters at two positions: sum[0] and sum[1] at `x`, sum[4] and sum[5] at `y`. */
-PLUSH_APART
-static void two_sums(const uint8_t *x, const uint8_t *y, const uint8_t *end, const uint8_t *w, uint32_t *sum)
-{
-    uint32_t s0 = 0, s1 = 0, t0 = 0, t1 = 0;
-
-    if (((end - x) & 4) != 0)
-        PLUSH_PAIR;
-    while (x != end) {
-        PLUSH_PAIR;
-        PLUSH_PAIR;
-    }
+    do {
+        PLUSH_CHANNEL(0, 0);
+        PLUSH_CHANNEL(2, 4);
+        PLUSH_CHANNEL(1, 8);
+        PLUSH_CHANNEL(3, 12);
+        x += 4;
+        w += 16;
+    } while (x != end);
     sum[0] = s0;
     sum[1] = s1;
-    sum[GROUP] = t0;
-    sum[GROUP + 1] = t1;
+    sum[2] = s2;
 }
-#endif
 
-/* The sums of four filters at two positions: sum[0] to sum[3] those at `x`, then those at `y`. */
-PLUSH_CODE
-static void pair_sums(const uint8_t *x, const uint8_t *y, uint32_t size, const uint8_t *w, uint32_t sum[2 * GROUP])
+/* The same at two positions. */
+PLUSH_APART
+static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const uint8_t *w, uint32_t sum[6])
 {
-#ifdef PLUSH_PAIR
-    two_sums(x, y, x + size, w, sum);
-    two_sums(x, y, x + size, w + 2 * GROUP, sum + 2);
-#endif
-#ifndef PLUSH_PAIR
-    four_sums(x, x + size, w, sum);
-    four_sums(y, y + size, w, sum + GROUP);
-#endif
+    uint32_t s0 = 0, s1 = 0, s2 = 0, t0 = 0, t1 = 0, t2 = 0;
+
+    do {
+        PLUSH_CHANNEL_OF_PAIR(0, 0);
+        PLUSH_CHANNEL_OF_PAIR(2, 4);
+        PLUSH_CHANNEL_OF_PAIR(1, 8);
+        PLUSH_CHANNEL_OF_PAIR(3, 12);
+        x += 4;
+        y += 4;
+        w += 16;
+    } while (x != end);
+    sum[0] = s0;
+    sum[1] = s1;
+    sum[2] = s2;
+    sum[3] = t0;
+    sum[4] = t1;
+    sum[5] = t2;
 }
 
 /* ReLU, and a sum to 8 bits. */
@@ -1016,28 +920,45 @@ static uint32_t requantize(int32_t sum, uint32_t times, uint32_t before, uint32_
     return t;
 }
 
+/* The activations of four filters at one position, or of the `n` that there are. `extra` is what surplus() says. The
+ * sums are kept above 0 by adding MIDDLE. */
+PLUSH_APART
+static void outputs(const uint32_t *three, uint32_t extra, const uint8_t *scale, uint32_t n, uint8_t *out)
+{
+    uint32_t e = extra - MIDDLE, a = three[0] - e * UINT32_C(0x01010101), b = three[1] - e * 257u;
+    uint32_t c = three[2] - e * 257u, sum[GROUP], i;
+
+    sum[0] = (a - (c << 8)) & UINT32_C(0xffffff);
+    sum[1] = (a - sum[0] - (b << 16)) >> 8;
+    sum[2] = (c - sum[1]) >> 8;
+    sum[3] = (b - sum[2]) >> 8;
+    for (i = 0; i < n; i++, scale += SCALE_BYTES) {
+        uint32_t how = aligned_le32(scale + 4);
+
+        out[i] = (uint8_t)requantize(as_signed(sum[i] - MIDDLE + aligned_le32(scale)), how & 0xffffu,
+                                     how >> 16 & 0xffu, how >> 24);
+    }
+}
+
 /* A new position of a layer, (filters) activations, or two: then `before` are those of the older one. */
 PLUSH_CODE
 static void advance(plush_layer *layer, int two, uint8_t *newest, uint8_t *before)
 {
     const uint8_t *x = (const uint8_t *)layer->taps[0], *y = (const uint8_t *)layer->taps[1];
     const uint8_t *weights = layer->weights, *scale = layer->scales;
-    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP, sum[2 * GROUP], f, i;
+    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP, sum[6], f;
     uint32_t extra_before = two ? surplus(layer, 1) : 0, extra = surplus(layer, 0);
 
-    for (f = 0; f < layer->filters; f += GROUP, weights += size * GROUP) {
-        if (two)
-            pair_sums(x, y, size, weights, sum);
-        else
-            four_sums(x, x + size, weights, sum);
-        for (i = 0; i < GROUP && f + i < layer->filters; i++, scale += SCALE_BYTES) {
-            uint32_t bias = le32(scale), times = le16(scale + 4), down = scale[6], after = scale[7];
+    for (f = 0; f < layer->filters; f += GROUP, weights += size * GROUP, scale += GROUP * SCALE_BYTES) {
+        uint32_t n = layer->filters - f < GROUP ? layer->filters - f : GROUP;
 
-            newest[f + i] = (uint8_t)requantize(as_signed(sum[i] + bias - extra), times, down, after);
-            if (two)
-                before[f + i] =
-                    (uint8_t)requantize(as_signed(sum[GROUP + i] + bias - extra_before), times, down, after);
+        if (two) {
+            pair(x, x + size, y, weights, sum);
+            outputs(sum + 3, extra_before, scale, n, before + f);
+        } else {
+            alone(x, x + size, weights, sum);
         }
+        outputs(sum, extra, scale, n, newest + f);
     }
 }
 
