@@ -21,7 +21,6 @@
 #define LOGIT_LIMIT 16384
 #define SPARE 4u            /* rows for new samples, before those under the taps move */
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
-#define MIDDLE (UINT32_C(1) << 23) /* beyond every sum of a convolution */
 
 /* Not copied to where it is called: for the registers of a loop, or for the flash. */
 #if defined(__GNUC__)
@@ -753,10 +752,14 @@ static uint32_t aligned_le32(const uint8_t *p)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
 /* The sums are in the high registers, which know additions only. */
 #define PLUSH_ADD(s, v) __asm__ volatile("add %0, %1" : "+h"(s) : "l"(v))
+#define PLUSH_NEXT_WORD(v, w) __asm__ volatile("ldmia %0!, {%1}" : "+l"(w), "=l"(v) : : "memory")
 #elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
 #else
 #define PLUSH_KEEP(v) ((void)0)
+#endif
+#ifndef PLUSH_NEXT_WORD
+#define PLUSH_NEXT_WORD(v, w) ((v) = aligned_le32(w), (w) += 4)
 #endif
 #ifndef PLUSH_ADD
 #define PLUSH_ADD(s, v) \
@@ -766,40 +769,68 @@ static uint32_t aligned_le32(const uint8_t *p)
     } while (0)
 #endif
 
-#define PLUSH_CHANNEL(i, at)                       \
+#define PLUSH_CHANNEL(i)                           \
     do {                                           \
-        uint32_t v = aligned_le32(w + (at)), a = x[i], p; \
-        p = v * a;                                 \
-        PLUSH_ADD(s0, p);                          \
+        uint32_t v, a = x[i], p;                   \
+        PLUSH_NEXT_WORD(v, w);                     \
         p = (v >> 16) * a;                         \
         PLUSH_ADD(s1, p);                          \
         p = (v >> 8 & 0xffffu) * a;                \
         PLUSH_ADD(s2, p);                          \
+        a *= v;                                    \
+        PLUSH_ADD(s0, a);                          \
     } while (0)
-#define PLUSH_CHANNEL_OF_PAIR(i, at)               \
+#if defined(__thumb__) && !defined(__thumb2__)
+#define PLUSH_CHANNEL_OF_PAIR(i)               \
     do {                                           \
-        uint32_t v = aligned_le32(w + (at)), a = x[i], b = y[i], u, p; \
+        uint32_t v, a = x[i], u, c; \
+        PLUSH_NEXT_WORD(v, w);                     \
+        u = v >> 16;                               \
+        u *= a;                                    \
+        PLUSH_ADD(s1, u);                          \
+        c = v >> 8 & 0xffffu;                      \
+        u = c * a;                                 \
+        PLUSH_ADD(s2, u);                          \
+        a *= v;                                    \
+        PLUSH_ADD(s0, a);                          \
+        PLUSH_KEEP(v);                             \
+        a = y[i];                                  \
+        u = (v >> 16) * a;                         \
+        PLUSH_ADD(t1, u);                          \
+        c *= a;                                    \
+        PLUSH_ADD(t2, c);                          \
+        a *= v;                                    \
+        t0 += a; __asm__ volatile("" : "+l"(t0));  \
+    } while (0)
+#else
+#define PLUSH_CHANNEL_OF_PAIR(i)               \
+    do {                                           \
+        uint32_t v, a = x[i], b, u, p;             \
+        PLUSH_NEXT_WORD(v, w);                     \
         u = v >> 16;                               \
         p = u * a;                                 \
         PLUSH_ADD(s1, p);                          \
-        p = u * b;                                 \
-        PLUSH_ADD(t1, p);                          \
-        u = v >> 8 & 0xffffu;                      \
-        p = u * a;                                 \
-        PLUSH_ADD(s2, p);                          \
-        p = u * b;                                 \
-        PLUSH_ADD(t2, p);                          \
+        b = y[i];                                  \
+        PLUSH_KEEP(b);                             \
+        u *= b;                                    \
+        PLUSH_ADD(t1, u);                          \
         p = v * a;                                 \
         PLUSH_ADD(s0, p);                          \
         p = v * b;                                 \
         PLUSH_ADD(t0, p);                          \
+        v = v >> 8 & 0xffffu;                      \
+        a *= v;                                    \
+        PLUSH_ADD(s2, a);                          \
+        b *= v;                                    \
+        PLUSH_ADD(t2, b);                          \
     } while (0)
+#endif
 #ifdef PLUSH_DSP
 #else
 #define PLUSH_SUM_BYTES(s, v)                                                      \
     do {                                                                           \
         uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
-        (s) += (two & 0xffffu) + (two >> 16);                                      \
+        (s) += two * 0x10001u >> 16;                                               \
     } while (0)
 #define PLUSH_LIMIT(v, bits)           \
     do {                               \
@@ -832,10 +863,11 @@ static uint8_t *next_row(plush_layer *layer)
     }
     phase = layer->ring + layer->phase * phase_rows(layer) * width;
     if (layer->row == layer->kernel) {
-        uint32_t *to = phase, *from = phase + SPARE * width, words;
+        uint32_t *to = phase, *from = phase + SPARE * width, *end = from + layer->kernel * width;
 
-        for (words = layer->kernel * width; words > 0; words--)
+        do
             *to++ = *from++;
+        while (from != end);
     }
     layer->taps[0] = phase + (layer->row + 1u - layer->kernel) * width;
     if (layer->dilation == 1) /* then the row before may have moved, too */
@@ -843,42 +875,35 @@ static uint8_t *next_row(plush_layer *layer)
     return (uint8_t *)newest_row(layer, layer->taps[0]);
 }
 
-/* The sum of all bytes of a row. */
-PLUSH_CODE
-static uint32_t row_sum(const plush_layer *layer, const uint32_t *row)
-{
-    uint32_t sum = 0, n;
-
-    for (n = layer->groups; n > 0; n--)
-        PLUSH_SUM_BYTES(sum, *row++);
-    return sum;
-}
-
 /* What every weight's + 128 adds to the sums of a position: 128 times all activations under the taps. Their sum is that
  * of `dilation` samples ago, less the row that has left, plus the one that has come. */
 PLUSH_CODE
 static uint32_t surplus(plush_layer *layer, uint32_t back)
 {
-    uint32_t phase = back <= layer->phase ? layer->phase - back : layer->dilation - 1u;
-    uint32_t sum = layer->tap_sums[phase] + row_sum(layer, newest_row(layer, layer->taps[back]));
+    uint32_t phase = back <= layer->phase ? layer->phase - back : layer->dilation - 1u, *sum = layer->tap_sums + phase;
+    const uint32_t *left = layer->taps[back], *come = newest_row(layer, layer->taps[back]);
+    uint32_t plus = *sum, minus = 0, n = layer->groups;
 
-    layer->tap_sums[phase] = sum - row_sum(layer, layer->taps[back]);
-    return sum * WEIGHT_ZERO;
+    do {
+        PLUSH_SUM_BYTES(plus, *come++);
+        PLUSH_SUM_BYTES(minus, *left++);
+    } while (--n > 0);
+    *sum = plus - minus;
+    return plus * WEIGHT_ZERO;
 }
 
 /* The three sums of four filters at one position. By itself, so that its loop has all registers. */
 PLUSH_APART
-static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[3])
+static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[GROUP])
 {
     uint32_t s0 = 0, s1 = 0, s2 = 0;
 
     do {
-        PLUSH_CHANNEL(0, 0);
-        PLUSH_CHANNEL(2, 4);
-        PLUSH_CHANNEL(1, 8);
-        PLUSH_CHANNEL(3, 12);
+        PLUSH_CHANNEL(0);
+        PLUSH_CHANNEL(2);
+        PLUSH_CHANNEL(1);
+        PLUSH_CHANNEL(3);
         x += 4;
-        w += 16;
     } while (x != end);
     sum[0] = s0;
     sum[1] = s1;
@@ -887,57 +912,52 @@ static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32
 
 /* The same at two positions. */
 PLUSH_APART
-static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const uint8_t *w, uint32_t sum[6])
+static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const uint8_t *w, uint32_t sum[2 * GROUP])
 {
     uint32_t s0 = 0, s1 = 0, s2 = 0, t0 = 0, t1 = 0, t2 = 0;
 
     do {
-        PLUSH_CHANNEL_OF_PAIR(0, 0);
-        PLUSH_CHANNEL_OF_PAIR(2, 4);
-        PLUSH_CHANNEL_OF_PAIR(1, 8);
-        PLUSH_CHANNEL_OF_PAIR(3, 12);
+        PLUSH_CHANNEL_OF_PAIR(0);
+        PLUSH_CHANNEL_OF_PAIR(2);
+        PLUSH_CHANNEL_OF_PAIR(1);
+        PLUSH_CHANNEL_OF_PAIR(3);
         x += 4;
         y += 4;
-        w += 16;
     } while (x != end);
     sum[0] = s0;
     sum[1] = s1;
     sum[2] = s2;
-    sum[3] = t0;
-    sum[4] = t1;
-    sum[5] = t2;
+    sum[4] = t0;
+    sum[5] = t1;
+    sum[6] = t2;
 }
 
-/* ReLU, and a sum to 8 bits. */
+/* ReLU, and a sum to 8 bits; rounded half up, also where `after` is 0. */
 PLUSH_CODE
 static uint32_t requantize(int32_t sum, uint32_t times, uint32_t before, uint32_t after)
 {
     uint32_t t = (uint32_t)(sum > 0 ? sum : 0) >> before;
 
     PLUSH_LIMIT(t, 16);
-    t = (t * times + half(after)) >> after;
+    t = ((2u * t * times >> after) + 1u) >> 1;
     PLUSH_LIMIT(t, 8);
     return t;
 }
 
-/* The activations of four filters at one position, or of the `n` that there are. `extra` is what surplus() says. The
- * sums are kept above 0 by adding MIDDLE. */
+/* The activations of four filters at one position, or of the `n` that there are. `sum` are the three sums of a kernel, and
+ * room for a fourth; `extra` is what surplus() says. */
 PLUSH_APART
-static void outputs(const uint32_t *three, uint32_t extra, const uint8_t *scale, uint32_t n, uint8_t *out)
+static void outputs(uint32_t *sum, uint32_t extra, const uint8_t *scale, uint32_t n, uint8_t *out)
 {
-    uint32_t e = extra - MIDDLE, a = three[0] - e * UINT32_C(0x01010101), b = three[1] - e * 257u;
-    uint32_t c = three[2] - e * 257u, sum[GROUP], i;
+    uint32_t twice = extra * 257u, a = sum[0] - twice - (twice << 16), b = sum[1] - twice, c = sum[2] - twice;
 
-    sum[0] = (a - (c << 8)) & UINT32_C(0xffffff);
-    sum[1] = (a - sum[0] - (b << 16)) >> 8;
-    sum[2] = (c - sum[1]) >> 8;
-    sum[3] = (b - sum[2]) >> 8;
-    for (i = 0; i < n; i++, scale += SCALE_BYTES) {
-        uint32_t how = aligned_le32(scale + 4);
-
-        out[i] = (uint8_t)requantize(as_signed(sum[i] - MIDDLE + aligned_le32(scale)), how & 0xffffu,
-                                     how >> 16 & 0xffu, how >> 24);
-    }
+    sum[0] = bits_of(shift_down(as_signed((a - (c << 8)) << 8), 8));
+    sum[1] = bits_of(shift_down(as_signed(a - (b << 16) - sum[0]), 8));
+    sum[2] = bits_of(shift_down(as_signed(c - sum[1]), 8));
+    sum[3] = bits_of(shift_down(as_signed(b - sum[2]), 8));
+    for (; n > 0; n--, scale += SCALE_BYTES)
+        *out++ = (uint8_t)requantize(as_signed(*sum++ + aligned_le32(scale)), aligned_le32(scale + 4) & 0xffffu, scale[6],
+                                     scale[7]);
 }
 
 /* A new position of a layer, (filters) activations, or two: then `before` are those of the older one. */
@@ -946,7 +966,7 @@ static void advance(plush_layer *layer, int two, uint8_t *newest, uint8_t *befor
 {
     const uint8_t *x = (const uint8_t *)layer->taps[0], *y = (const uint8_t *)layer->taps[1];
     const uint8_t *weights = layer->weights, *scale = layer->scales;
-    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP, sum[6], f;
+    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP, sum[2 * GROUP], f;
     uint32_t extra_before = two ? surplus(layer, 1) : 0, extra = surplus(layer, 0);
 
     for (f = 0; f < layer->filters; f += GROUP, weights += size * GROUP, scale += GROUP * SCALE_BYTES) {
@@ -954,7 +974,7 @@ static void advance(plush_layer *layer, int two, uint8_t *newest, uint8_t *befor
 
         if (two) {
             pair(x, x + size, y, weights, sum);
-            outputs(sum + 3, extra_before, scale, n, before + f);
+            outputs(sum + GROUP, extra_before, scale, n, before + f);
         } else {
             alone(x, x + size, weights, sum);
         }
@@ -1690,7 +1710,7 @@ static void put_axes(plush_toy *toy, const int32_t *axes)
 
 /* The sums of one kernel over the taps of three axes, from the oldest; `axes` are those of the first row. */
 PLUSH_APART
-static void convolve(const plush_toy *toy, const int16_t *axes, const uint8_t *weights, uint32_t sum[3])
+static void convolve(const plush_toy *toy, const int16_t *axes, const uint8_t *weights, uint32_t sum[GROUP])
 {
     uint32_t width = 3u * toy->vectors, taps = toy->vector_taps, s0 = 0, s1 = 0, s2 = 0;
     const int16_t *end = axes + taps * width, *a = axes + toy->vector_newest * width;
