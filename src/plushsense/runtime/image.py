@@ -405,4 +405,6 @@ def grouped_weights(weights: NDArray[np.int8]) -> NDArray[np.uint8]:
     full = np.zeros((_filled(f), _filled(c), k), dtype=np.int16)
     full[:f, :c] = weights
     split = full.reshape(len(full) // GROUP, GROUP, full.shape[1] // GROUP, GROUP, k)
-    return np.ascontiguousarray(split.transpose(0, 4, 2, 3, 1)[:, :, :, [0, 2, 1, 3]] + 128).astype(np.uint8)
+    codes = np.ascontiguousarray(split.transpose(0, 4, 2, 3, 1)[:, :, :, [0, 2, 1, 3]] + 128).astype(np.uint8)
+    codes[..., 3] ^= 128
+    return codes

@@ -128,6 +128,19 @@ static uint32_t le32(const uint8_t *p)
     return le16(p) | (le16(p + 2) << 16);
 }
 
+/* The same at a multiple of 4. */
+#if defined(__GNUC__) && defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
+static uint32_t aligned_le32(const uint8_t *p)
+{
+    uint32_t v;
+
+    __builtin_memcpy(&v, __builtin_assume_aligned(p, GROUP), sizeof v);
+    return v;
+}
+#else
+#define aligned_le32 le32
+#endif
+
 /* The number with these bits in two's complement. */
 static int32_t as_signed(uint32_t bits)
 {
@@ -721,45 +734,121 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 
 /* ---- What differs from core to core ----------------------------------------------------------------------------- */
 
-/* Four sums of at most 24 bits each are found by three multiplications of 32 bits instead of four. With the weights
- * u0 to u3 (+ 128) of four filters for one channel in a word v, lowest first, and modulo 2^32, the sums over all channels
+/* The weights of four filters for one channel are the bytes of a word: 128 is added to the first three. Three products of
+ * 32 bits stand for four of 8 bits, as no sum of a convolution has more than 24. Modulo 2^32, the sums over all channels
  *
- *     of activation * v                       are  a = S0 + 2^8 S1 + 2^16 S2 + 2^24 S3
- *     of activation * (v >> 16)               are  b = S2 + 2^8 S3
- *     of activation * ((v >> 8) & 0xffff)     are  c = S1 + 2^8 S2
+ *     of the activation * the word                   are  a = s0 + 2^8 s1 + 2^16 s2 + 2^24 s3
+ *     of the activation * its high half, signed      are  b = s2 + 2^8 s3
+ *     of the activation * the two bytes between      are  c = s1 + 2^8 s2
  *
- * and a - 2^8 c has S0 in its low 24 bits, from which the others follow: see outputs().
+ * and the low 24 bits of a - 2^8 c are s0, from which the others follow: see outputs(). Other instructions may have other
+ * sums.
  *
+ *     PLUSH_ALONE            the next 4 activations at `x`, times the weights of 4 filters at `w`: words of the channels
+ *                            0, 2, 1 and 3
+ *     PLUSH_PAIR             the same at `x` and at `y`: a weight is loaded once for two positions
+ *     PLUSH_SUMS             what they sum up in; PLUSH_GIVE_ALONE and PLUSH_GIVE_PAIR put it into `sum`
  *     PLUSH_SUM_BYTES(s, v)  the four bytes of a word, into `s`
  *     PLUSH_LIMIT(v, bits)   a number below 2^31, at most the highest of so many bits
- */
-#if defined(__GNUC__) && defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
-/* le32() of what lies at a multiple of 4. */
-static uint32_t aligned_le32(const uint8_t *p)
-{
-    uint32_t v;
+ *
+ * PLUSH_PLAIN asks for plain C everywhere. */
+#if defined(__GNUC__) && defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && !defined(PLUSH_PLAIN)
 
-    __builtin_memcpy(&v, __builtin_assume_aligned(p, 4), sizeof v);
-    return v;
-}
+#define PLUSH_DSP
+#define PLUSH_SUM_BYTES(s, v) __asm__("usada8 %0, %1, %2, %0" : "+r"(s) : "r"(v), "r"(0))
+#define PLUSH_LIMIT(v, bits) __asm__("usat %0, %1, %0" : "+r"(v) : "i"(bits))
+
+/* Two halves in a register, of two channels: weights of filters 0 and 1 in `a`, of 2 and 3 in `b`, of 1 and 2 in `c`. A
+ * half is signed: its highest bit is turned where 128 was added. */
+#define PLUSH_WEIGHTS                                                                                      \
+    __asm__ volatile("ldrd %[c], %[d], [%[w]], #8\n\t"                                                     \
+                     "pkhbt %[a], %[c], %[d], lsl #16\n\teor %[a], %[a], #0x80008000\n\t"                  \
+                     "pkhtb %[b], %[d], %[c], asr #16\n\t"                                                 \
+                     "lsr %[c], %[c], #8\n\tpkhbt %[c], %[c], %[d], lsl #8\n\teor %[c], %[c], #0x80008000" \
+                     : [w] "+&r"(w), [a] "=&r"(a), [b] "=&r"(b), [c] "=&r"(c), [d] "=&r"(d)                \
+                     :                                                                                     \
+                     : "memory")
+#define PLUSH_PRODUCTS(x, next, turn, s, t, u)                                                             \
+    __asm__ volatile("ldr %[d], [%[p]]" next "\n\tuxtb16 %[d], %[d]" turn "\n\t"                           \
+                     "smlad %[i], %[d], %[a], %[i]\n\tsmlad %[j], %[d], %[b], %[j]\n\t"                    \
+                     "smlad %[k], %[d], %[c], %[k]"                                                        \
+                     : [p] "+&r"(x), [i] "+&r"(s), [j] "+&r"(t), [k] "+&r"(u), [d] "=&r"(d)                \
+                     : [a] "r"(a), [b] "r"(b), [c] "r"(c)                                                  \
+                     : "memory")
+#define PLUSH_ALONE                                                \
+    do {                                                           \
+        uint32_t a, b, c, d;                                       \
+        PLUSH_WEIGHTS;                                             \
+        PLUSH_PRODUCTS(x, "", "", s0, s1, s2);                     \
+        PLUSH_WEIGHTS;                                             \
+        PLUSH_PRODUCTS(x, ", #4", ", ror #8", s0, s1, s2);         \
+    } while (0)
+#define PLUSH_PAIR                                                 \
+    do {                                                           \
+        uint32_t a, b, c, d;                                       \
+        PLUSH_WEIGHTS;                                             \
+        PLUSH_PRODUCTS(x, "", "", s0, s1, s2);                     \
+        PLUSH_PRODUCTS(y, "", "", t0, t1, t2);                     \
+        PLUSH_WEIGHTS;                                             \
+        PLUSH_PRODUCTS(x, ", #4", ", ror #8", s0, s1, s2);         \
+        PLUSH_PRODUCTS(y, ", #4", ", ror #8", t0, t1, t2);         \
+    } while (0)
+
+#elif defined(__SSE2__) && !defined(PLUSH_PLAIN)
+
+#include <emmintrin.h>
+
+/* Products of 16 bits, of two channels of a filter side by side; each sum by itself. */
+#define PLUSH_EACH
+#define PLUSH_SUMS __m128i zero = _mm_setzero_si128(), s = zero, t = zero
+#define PLUSH_WEIGHTS                                                                                         \
+    __m128i v = _mm_loadu_si128((const __m128i *)(const void *)w), b, c;                                      \
+    v = _mm_xor_si128(v, _mm_set1_epi32(INT32_MIN)); /* 128 is added to the last filter's, too */             \
+    v = _mm_unpacklo_epi8(v, _mm_unpackhi_epi64(v, v));                                                       \
+    b = _mm_unpacklo_epi8(v, zero);                                                                           \
+    c = _mm_unpackhi_epi8(v, zero);                                                                           \
+    w += 16
+#define PLUSH_PRODUCTS(x, s)                                                            \
+    do {                                                                                \
+        int32_t four;                                                                   \
+        __m128i a;                                                                      \
+        memcpy(&four, x, 4);                                                            \
+        a = _mm_unpacklo_epi8(_mm_cvtsi32_si128(four), zero);                           \
+        s = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x00), b));            \
+        s = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x55), c));            \
+        x += 4;                                                                         \
+    } while (0)
+#define PLUSH_ALONE           \
+    do {                      \
+        PLUSH_WEIGHTS;        \
+        PLUSH_PRODUCTS(x, s); \
+    } while (0)
+#define PLUSH_PAIR            \
+    do {                      \
+        PLUSH_WEIGHTS;        \
+        PLUSH_PRODUCTS(x, s); \
+        PLUSH_PRODUCTS(y, t); \
+    } while (0)
+#define PLUSH_GIVE_ALONE memcpy(sum, &s, sizeof s)
+#define PLUSH_GIVE_PAIR            \
+    do {                           \
+        PLUSH_GIVE_ALONE;          \
+        memcpy(sum + 4, &t, sizeof t); \
+    } while (0)
+
 #else
-#define aligned_le32 le32
-#endif
 
 /* Keeps a value in a register, and what is done to it in the written order: otherwise compilers add products up in trees,
  * for which small cores have too few registers. */
-#if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__)
+#if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__) && defined(__OPTIMIZE__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
-/* The sums are in the high registers, which know additions only. */
+/* Eight registers multiply, and the others can be added to. */
 #define PLUSH_ADD(s, v) __asm__ volatile("add %0, %1" : "+h"(s) : "l"(v))
-#define PLUSH_NEXT_WORD(v, w) __asm__ volatile("ldmia %0!, {%1}" : "+l"(w), "=l"(v) : : "memory")
+#define PLUSH_NEXT_WORD(v) __asm__ volatile("ldmia %0!, {%1}" : "+l"(w), "=l"(v) : : "memory")
 #elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
 #else
 #define PLUSH_KEEP(v) ((void)0)
-#endif
-#ifndef PLUSH_NEXT_WORD
-#define PLUSH_NEXT_WORD(v, w) ((v) = aligned_le32(w), (w) += 4)
 #endif
 #ifndef PLUSH_ADD
 #define PLUSH_ADD(s, v) \
@@ -767,66 +856,93 @@ static uint32_t aligned_le32(const uint8_t *p)
         (s) += (v);     \
         PLUSH_KEEP(s);  \
     } while (0)
+#define PLUSH_NEXT_WORD(v) ((v) = aligned_le32(w), w += 4)
 #endif
-
-#define PLUSH_CHANNEL(i)                           \
-    do {                                           \
-        uint32_t v, a = x[i], p;                   \
-        PLUSH_NEXT_WORD(v, w);                     \
-        p = (v >> 16) * a;                         \
-        PLUSH_ADD(s1, p);                          \
-        p = (v >> 8 & 0xffffu) * a;                \
-        PLUSH_ADD(s2, p);                          \
-        a *= v;                                    \
-        PLUSH_ADD(s0, a);                          \
+#define PLUSH_HIGH(v) bits_of(shift_down(as_signed(v), 16))
+#define PLUSH_CHANNEL(i)            \
+    do {                            \
+        uint32_t v, a = x[i], p;    \
+        PLUSH_NEXT_WORD(v);         \
+        p = PLUSH_HIGH(v) * a;      \
+        PLUSH_ADD(s1, p);           \
+        p = (v >> 8 & 0xffffu) * a; \
+        PLUSH_ADD(s2, p);           \
+        a *= v;                     \
+        PLUSH_ADD(s0, a);           \
+    } while (0)
+#define PLUSH_ALONE       \
+    do {                  \
+        PLUSH_CHANNEL(0); \
+        PLUSH_CHANNEL(2); \
+        PLUSH_CHANNEL(1); \
+        PLUSH_CHANNEL(3); \
+        x += 4;           \
     } while (0)
 #if defined(__thumb__) && !defined(__thumb2__)
-#define PLUSH_CHANNEL_OF_PAIR(i)               \
-    do {                                           \
-        uint32_t v, a = x[i], u, c; \
-        PLUSH_NEXT_WORD(v, w);                     \
-        u = v >> 16;                               \
-        u *= a;                                    \
-        PLUSH_ADD(s1, u);                          \
-        c = v >> 8 & 0xffffu;                      \
-        u = c * a;                                 \
-        PLUSH_ADD(s2, u);                          \
-        a *= v;                                    \
-        PLUSH_ADD(s0, a);                          \
-        PLUSH_KEEP(v);                             \
-        a = y[i];                                  \
-        u = (v >> 16) * a;                         \
-        PLUSH_ADD(t1, u);                          \
-        c *= a;                                    \
-        PLUSH_ADD(t2, c);                          \
-        a *= v;                                    \
-        t0 += a; __asm__ volatile("" : "+l"(t0));  \
+/* A product takes the place of a factor: in this order, one more copy is enough. */
+#define PLUSH_CHANNEL_OF_PAIR(i)    \
+    do {                            \
+        uint32_t v, a = x[i], p, c; \
+        PLUSH_NEXT_WORD(v);         \
+        p = PLUSH_HIGH(v) * a;      \
+        PLUSH_ADD(s1, p);           \
+        c = v >> 8 & 0xffffu;       \
+        p = c * a;                  \
+        PLUSH_ADD(s2, p);           \
+        a *= v;                     \
+        PLUSH_ADD(s0, a);           \
+        PLUSH_KEEP(v);              \
+        a = y[i];                   \
+        p = PLUSH_HIGH(v) * a;      \
+        PLUSH_ADD(t1, p);           \
+        c *= a;                     \
+        PLUSH_ADD(t2, c);           \
+        a *= v;                     \
+        t0 += a;                    \
+        PLUSH_KEEP(t0);             \
     } while (0)
 #else
-#define PLUSH_CHANNEL_OF_PAIR(i)               \
-    do {                                           \
-        uint32_t v, a = x[i], b, u, p;             \
-        PLUSH_NEXT_WORD(v, w);                     \
-        u = v >> 16;                               \
-        p = u * a;                                 \
-        PLUSH_ADD(s1, p);                          \
-        b = y[i];                                  \
-        PLUSH_KEEP(b);                             \
-        u *= b;                                    \
-        PLUSH_ADD(t1, u);                          \
-        p = v * a;                                 \
-        PLUSH_ADD(s0, p);                          \
-        p = v * b;                                 \
-        PLUSH_ADD(t0, p);                          \
-        v = v >> 8 & 0xffffu;                      \
-        a *= v;                                    \
-        PLUSH_ADD(s2, a);                          \
-        b *= v;                                    \
-        PLUSH_ADD(t2, b);                          \
+/* In this order, 14 registers are enough for the loop. */
+#define PLUSH_CHANNEL_OF_PAIR(i)       \
+    do {                               \
+        uint32_t v, a = x[i], b, p, q; \
+        PLUSH_NEXT_WORD(v);            \
+        q = PLUSH_HIGH(v);             \
+        p = q * a;                     \
+        PLUSH_ADD(s1, p);              \
+        b = y[i];                      \
+        PLUSH_KEEP(b);                 \
+        q *= b;                        \
+        PLUSH_ADD(t1, q);              \
+        p = v * a;                     \
+        PLUSH_ADD(s0, p);              \
+        p = v * b;                     \
+        PLUSH_ADD(t0, p);              \
+        v = v >> 8 & 0xffffu;          \
+        a *= v;                        \
+        PLUSH_ADD(s2, a);              \
+        b *= v;                        \
+        PLUSH_ADD(t2, b);              \
     } while (0)
 #endif
-#ifdef PLUSH_DSP
-#else
+#define PLUSH_PAIR                \
+    do {                          \
+        PLUSH_CHANNEL_OF_PAIR(0); \
+        PLUSH_CHANNEL_OF_PAIR(2); \
+        PLUSH_CHANNEL_OF_PAIR(1); \
+        PLUSH_CHANNEL_OF_PAIR(3); \
+        x += 4;                   \
+        y += 4;                   \
+    } while (0)
+
+#endif
+
+#ifndef PLUSH_SUMS
+#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, t0 = 0, t1 = 0, t2 = 0
+#define PLUSH_GIVE_ALONE (sum[0] = s0, sum[1] = s1, sum[2] = s2, (void)t0, (void)t1, (void)t2)
+#define PLUSH_GIVE_PAIR (sum[0] = s0, sum[1] = s1, sum[2] = s2, sum[4] = t0, sum[5] = t1, sum[6] = t2)
+#endif
+#ifndef PLUSH_DSP
 #define PLUSH_SUM_BYTES(s, v)                                                      \
     do {                                                                           \
         uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
@@ -892,44 +1008,28 @@ static uint32_t surplus(plush_layer *layer, uint32_t back)
     return plus * WEIGHT_ZERO;
 }
 
-/* The three sums of four filters at one position. By itself, so that its loop has all registers. */
+/* What is summed up of four filters at one position. By itself, so that its loop has all registers. */
 PLUSH_APART
 static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[GROUP])
 {
-    uint32_t s0 = 0, s1 = 0, s2 = 0;
+    PLUSH_SUMS;
 
-    do {
-        PLUSH_CHANNEL(0);
-        PLUSH_CHANNEL(2);
-        PLUSH_CHANNEL(1);
-        PLUSH_CHANNEL(3);
-        x += 4;
-    } while (x != end);
-    sum[0] = s0;
-    sum[1] = s1;
-    sum[2] = s2;
+    do
+        PLUSH_ALONE;
+    while (x != end);
+    PLUSH_GIVE_ALONE;
 }
 
-/* The same at two positions. */
+/* The same at two positions, `x` first. */
 PLUSH_APART
 static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const uint8_t *w, uint32_t sum[2 * GROUP])
 {
-    uint32_t s0 = 0, s1 = 0, s2 = 0, t0 = 0, t1 = 0, t2 = 0;
+    PLUSH_SUMS;
 
-    do {
-        PLUSH_CHANNEL_OF_PAIR(0);
-        PLUSH_CHANNEL_OF_PAIR(2);
-        PLUSH_CHANNEL_OF_PAIR(1);
-        PLUSH_CHANNEL_OF_PAIR(3);
-        x += 4;
-        y += 4;
-    } while (x != end);
-    sum[0] = s0;
-    sum[1] = s1;
-    sum[2] = s2;
-    sum[4] = t0;
-    sum[5] = t1;
-    sum[6] = t2;
+    do
+        PLUSH_PAIR;
+    while (x != end);
+    PLUSH_GIVE_PAIR;
 }
 
 /* ReLU, and a sum to 8 bits; rounded half up, also where `after` is 0. */
@@ -944,17 +1044,28 @@ static uint32_t requantize(int32_t sum, uint32_t times, uint32_t before, uint32_
     return t;
 }
 
-/* The activations of four filters at one position, or of the `n` that there are. `sum` are the three sums of a kernel, and
- * room for a fourth; `extra` is what surplus() says. */
+/* The activations at one position of four filters, or of the `n` that there are; `sum` is what was summed up of them, and
+ * `extra` what surplus() says. */
 PLUSH_APART
-static void outputs(uint32_t *sum, uint32_t extra, const uint8_t *scale, uint32_t n, uint8_t *out)
+static void outputs(uint32_t sum[GROUP], uint32_t extra, const uint8_t *scale, uint32_t n, uint8_t *out)
 {
-    uint32_t twice = extra * 257u, a = sum[0] - twice - (twice << 16), b = sum[1] - twice, c = sum[2] - twice;
+#ifdef PLUSH_EACH
+    uint32_t i;
+
+    for (i = 0; i < GROUP; i++)
+        sum[i] -= extra;
+#else
+#ifdef PLUSH_DSP
+    uint32_t b = sum[1] - extra, c = sum[2] - extra, a = sum[0] - extra + (b << 16);
+#else
+    uint32_t b = sum[1] - extra, c = sum[2] - extra * 257u, a = sum[0] - extra * UINT32_C(0x10101);
+#endif
 
     sum[0] = bits_of(shift_down(as_signed((a - (c << 8)) << 8), 8));
     sum[1] = bits_of(shift_down(as_signed(a - (b << 16) - sum[0]), 8));
     sum[2] = bits_of(shift_down(as_signed(c - sum[1]), 8));
     sum[3] = bits_of(shift_down(as_signed(b - sum[2]), 8));
+#endif
     for (; n > 0; n--, scale += SCALE_BYTES)
         *out++ = (uint8_t)requantize(as_signed(*sum++ + aligned_le32(scale)), aligned_le32(scale + 4) & 0xffffu, scale[6],
                                      scale[7]);
@@ -1710,7 +1821,7 @@ static void put_axes(plush_toy *toy, const int32_t *axes)
 
 /* The sums of one kernel over the taps of three axes, from the oldest; `axes` are those of the first row. */
 PLUSH_APART
-static void convolve(const plush_toy *toy, const int16_t *axes, const uint8_t *weights, uint32_t sum[GROUP])
+static void convolve(const plush_toy *toy, const int16_t *axes, const uint8_t *weights, uint32_t sum[3])
 {
     uint32_t width = 3u * toy->vectors, taps = toy->vector_taps, s0 = 0, s1 = 0, s2 = 0;
     const int16_t *end = axes + taps * width, *a = axes + toy->vector_newest * width;
