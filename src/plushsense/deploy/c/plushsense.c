@@ -741,13 +741,13 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
  *     of the activation * its high half, signed      are  b = s2 + 2^8 s3
  *     of the activation * the two bytes between      are  c = s1 + 2^8 s2
  *
- * and the low 24 bits of a - 2^8 c are s0, from which the others follow: see outputs(). Other instructions may have other
+ * and the low 24 bits of a - 2^8 c are s0, from which the others follow: see activations(). Other instructions may have other
  * sums.
  *
  *     PLUSH_ALONE            the next 4 activations at `x`, times the weights of 4 filters at `w`: words of the channels
  *                            0, 2, 1 and 3
  *     PLUSH_PAIR             the same at `x` and at `y`: a weight is loaded once for two positions
- *     PLUSH_SUMS             what they sum up in; PLUSH_GIVE_ALONE and PLUSH_GIVE_PAIR put it into `sum`
+ *     PLUSH_SUMS(s)          what is summed up at `x`, and `t` at `y`; PLUSH_GIVE puts it into `sum`
  *     PLUSH_SUM_BYTES(s, v)  the four bytes of a word, into `s`
  *     PLUSH_LIMIT(v, bits)   a number below 2^31, at most the highest of so many bits
  *
@@ -800,9 +800,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 
 /* Products of 16 bits, of two channels of a filter side by side; each sum by itself. */
 #define PLUSH_EACH
-#define PLUSH_SUMS __m128i zero = _mm_setzero_si128(), s = zero, t = zero
+#define PLUSH_SUMS(s) __m128i s = _mm_setzero_si128()
+#define PLUSH_GIVE(s, sum) memcpy(sum, &(s), sizeof(s))
 #define PLUSH_WEIGHTS                                                                                         \
-    __m128i v = _mm_loadu_si128((const __m128i *)(const void *)w), b, c;                                      \
+    __m128i v = _mm_loadu_si128((const __m128i *)(const void *)w), zero = _mm_setzero_si128(), b, c;          \
     v = _mm_xor_si128(v, _mm_set1_epi32(INT32_MIN)); /* 128 is added to the last filter's, too */             \
     v = _mm_unpacklo_epi8(v, _mm_unpackhi_epi64(v, v));                                                       \
     b = _mm_unpacklo_epi8(v, zero);                                                                           \
@@ -814,9 +815,9 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         __m128i a;                                                                      \
         memcpy(&four, x, 4);                                                            \
         a = _mm_unpacklo_epi8(_mm_cvtsi32_si128(four), zero);                           \
-        s = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x00), b));            \
-        s = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x55), c));            \
-        x += 4;                                                                         \
+        (s) = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x00), b));          \
+        (s) = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x55), c));          \
+        (x) += 4;                                                                       \
     } while (0)
 #define PLUSH_ALONE           \
     do {                      \
@@ -828,12 +829,6 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         PLUSH_WEIGHTS;        \
         PLUSH_PRODUCTS(x, s); \
         PLUSH_PRODUCTS(y, t); \
-    } while (0)
-#define PLUSH_GIVE_ALONE memcpy(sum, &s, sizeof s)
-#define PLUSH_GIVE_PAIR            \
-    do {                           \
-        PLUSH_GIVE_ALONE;          \
-        memcpy(sum + 4, &t, sizeof t); \
     } while (0)
 
 #else
@@ -938,9 +933,13 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 #endif
 
 #ifndef PLUSH_SUMS
-#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, t0 = 0, t1 = 0, t2 = 0
-#define PLUSH_GIVE_ALONE (sum[0] = s0, sum[1] = s1, sum[2] = s2, (void)t0, (void)t1, (void)t2)
-#define PLUSH_GIVE_PAIR (sum[0] = s0, sum[1] = s1, sum[2] = s2, sum[4] = t0, sum[5] = t1, sum[6] = t2)
+#define PLUSH_SUMS(s) uint32_t s##0 = 0, s##1 = 0, s##2 = 0
+#define PLUSH_GIVE(s, sum)   \
+    do {                     \
+        (sum)[0] = s##0;     \
+        (sum)[1] = s##1;     \
+        (sum)[2] = s##2;     \
+    } while (0)
 #endif
 #ifndef PLUSH_DSP
 #define PLUSH_SUM_BYTES(s, v)                                                      \
@@ -1012,24 +1011,26 @@ static uint32_t surplus(plush_layer *layer, uint32_t back)
 PLUSH_APART
 static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[GROUP])
 {
-    PLUSH_SUMS;
+    PLUSH_SUMS(s);
 
     do
         PLUSH_ALONE;
     while (x != end);
-    PLUSH_GIVE_ALONE;
+    PLUSH_GIVE(s, sum);
 }
 
 /* The same at two positions, `x` first. */
 PLUSH_APART
 static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const uint8_t *w, uint32_t sum[2 * GROUP])
 {
-    PLUSH_SUMS;
+    PLUSH_SUMS(s);
+    PLUSH_SUMS(t);
 
     do
         PLUSH_PAIR;
     while (x != end);
-    PLUSH_GIVE_PAIR;
+    PLUSH_GIVE(s, sum);
+    PLUSH_GIVE(t, sum + GROUP);
 }
 
 /* ReLU, and a sum to 8 bits; rounded half up, also where `after` is 0. */
@@ -1047,7 +1048,7 @@ static uint32_t requantize(int32_t sum, uint32_t times, uint32_t before, uint32_
 /* The activations at one position of four filters, or of the `n` that there are; `sum` is what was summed up of them, and
  * `extra` what surplus() says. */
 PLUSH_APART
-static void outputs(uint32_t sum[GROUP], uint32_t extra, const uint8_t *scale, uint32_t n, uint8_t *out)
+static void activations(uint32_t sum[GROUP], uint32_t extra, const uint8_t *scale, uint32_t n, uint8_t *out)
 {
 #ifdef PLUSH_EACH
     uint32_t i;
@@ -1085,11 +1086,11 @@ static void advance(plush_layer *layer, int two, uint8_t *newest, uint8_t *befor
 
         if (two) {
             pair(x, x + size, y, weights, sum);
-            outputs(sum + GROUP, extra_before, scale, n, before + f);
+            activations(sum + GROUP, extra_before, scale, n, before + f);
         } else {
             alone(x, x + size, weights, sum);
         }
-        outputs(sum, extra, scale, n, newest + f);
+        activations(sum, extra, scale, n, newest + f);
     }
 }
 

@@ -44,9 +44,9 @@ extern "C" {
 
 /* #undef PLUSH_CALIBRATE */
 #ifdef PLUSH_CALIBRATE /* a model whose sensors find their offset and scale themselves; see plush_calibrate.h */
-#define PLUSH_IMAGE_VERSION 8
+#define PLUSH_IMAGE_VERSION 11
 #else
-#define PLUSH_IMAGE_VERSION 6
+#define PLUSH_IMAGE_VERSION 10
 #endif
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
