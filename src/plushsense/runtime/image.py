@@ -62,7 +62,8 @@ from plushsense.runtime.integer import MOST_AXIS_SHIFT, IntegerNetwork, IntegerV
 
 MAGIC = b"PLSH"
 PATCH_MAGIC = b"PLPT"
-# 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score; 6: aligned weights; 10: four filters a word
+# 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score; 6: aligned weights
+# 10: four filters in a word
 IMAGE_VERSION = 10
 CALIBRATED_IMAGE_VERSION = 11  # of a model with a self-calibration
 _WINDOW_VERSIONS = (7, 9)  # once of networks that computed a window again at every step
