@@ -87,7 +87,7 @@ def test_the_arduino_library_keeps_the_rules_of_arduino_lint(packages: Packages,
             ("category=Data Processing", "category=Toys", "category"),
             ("license=MIT", "licence=MIT", "known fields"),
             ("version=", "version=v", "version"),
-            ("architectures=*", "architectures=ESP 32", "architectures"),
+            ("architectures=esp32,", "architectures=ESP 32,", "architectures"),
         )
     ):
         library = Path(shutil.copytree(packages["accel-3"][0] / ARDUINO, tmp_path / str(n) / "PlushSense"))
@@ -293,6 +293,8 @@ def test_what_the_manifests_name_exists(packages: Packages) -> None:
         assert all((library / "src" / name).is_file() for name in properties["includes"].split(","))
         manifest = json.loads((library / "library.json").read_text(encoding="utf-8"))
         assert all((library / "src" / name).is_file() for name in manifest["headers"])
+        boards = {*properties["architectures"].split(","), *manifest["platforms"]}
+        assert {"esp32", "rp2040", "espressif32", "raspberrypi"} <= boards and not boards & {"*", "avr", "atmelavr"}
         for example in manifest["examples"]:
             assert all((library / example["base"] / name).is_file() for name in example["files"])
         assert manifest["version"] == properties["version"] == read_facts(out).model_version

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from plushsense.core.errors import BadInput, ProgramError, ToolError
+from plushsense.core.errors import BadInput, ConfigError, ProgramError, ToolError, check_known
 from plushsense.core.toml import load_table, read_toml
 from plushsense.deploy.code import GOLDEN, LIBRARY, MODEL, ModelFacts
 from plushsense.deploy.golden import read_golden
@@ -24,7 +24,6 @@ from plushsense.deploy.targets import (
     build,
     missing_tools,
     require,
-    target_named,
     tool,
     tool_output,
 )
@@ -502,7 +501,7 @@ def profile(
 
     Args:
         folder: the folder that ``plushsense export`` wrote.
-        targets: names of `TARGETS`; by default all that count instructions and are installed.
+        targets: names of `TARGETS` that count instructions, or "host"; by default all of the former that are installed.
         optimise: optimisation flag of the compilers.
         trust: whether to compile and run code in a folder with files that differ from what this version writes.
         progress: called with (targets done, number of targets).
@@ -518,8 +517,11 @@ def profile(
     arch = export.model.network.arch
     if not trust:
         export.require_unchanged()
-    names = list(dict.fromkeys(targets)) or [name for name, target in TARGETS.items() if target.counts]
-    missing = {name: lacks for name in names if (lacks := missing_tools(target_named(name).name))}
+    counting = [name for name, target in TARGETS.items() if target.counts]
+    for name in targets:
+        check_known(name, [*counting, "host"], "target to profile", ConfigError)
+    names = list(dict.fromkeys(targets)) or counting
+    missing = {name: lacks for name in names if (lacks := missing_tools(name))}
     if targets:
         for name in missing:
             require(name)

@@ -1,4 +1,4 @@
-"""Machines on which an exported C program can be built and run: this computer and chips emulated by QEMU.
+"""Machines on which an exported C program can be built and run: this computer and emulated ones.
 
 QEMU runs with ``-icount``, so that instruction counts are the same in every run; they are not the cycles of a real
 chip. Each target is a table in ``targets.toml``; start-up code and linker scripts are in ``c/runtime``. Package names
@@ -40,7 +40,11 @@ class Target:
     link: tuple[str, ...] = ()
     run: tuple[str, ...] = ()
     libraries: Mapping[str, str] = field(default_factory=dict)
+    emulator: tuple[str, ...] = ()
+    assembler: str = ""
+    optimise: tuple[str, ...] = ("-O2", "-Os")
     counts: bool = True
+    slow: bool = False
 
 
 def _read_targets() -> dict[str, Target]:
@@ -65,8 +69,8 @@ class Program:
     file: Path
     objects: tuple[Path, ...]
 
-    def run(self, *, timeout_s: float = 120.0) -> bytes:
-        """Run the program and return its standard output.
+    def run(self, *, timeout_s: float = 120.0, given: Path | None = None) -> bytes:
+        """Run the program, with the file ``given`` as standard input, and return its standard output.
 
         Raises:
             ProgramError: for an exit status other than 0 (98 for a crash in an emulator), or a timeout.
@@ -74,9 +78,10 @@ class Program:
         command = [*self.target.run, str(self.file)]
         where = f"The test program on {self.target.name}"
         try:
-            result = subprocess.run(
-                command, cwd=self.file.parent, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s
-            )
+            with open(given or os.devnull, "rb") as file:
+                result = subprocess.run(
+                    command, cwd=self.file.parent, stdin=file, capture_output=True, timeout=timeout_s
+                )
         except subprocess.TimeoutExpired:
             raise ProgramError(f"{where} did not end within {timeout_s:g} s: it was stopped.", "") from None
         except OSError as cause:
@@ -105,7 +110,8 @@ def missing_tools(target: str, *, cc: str | None = None) -> list[str]:
         tools = {cc: Path(cc).name} | {t: p for t, p in tools.items() if t != machine.compiler}
     missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
     for file, package in machine.libraries.items():
-        if shutil.which(machine.compiler) is None or not _compiler_has(machine.compiler, file):
+        compiler = "gcc" if file.endswith(".so") else machine.compiler
+        if shutil.which(compiler) is None or not _compiler_has(compiler, file):
             missing.append(package)
     return list(dict.fromkeys(missing))
 
@@ -169,7 +175,8 @@ def build(
             parts.append((listing, ["-w"]))
         objects = []
         for n, (source, options) in enumerate(parts):
-            compiling = [compiler, *machine.flags, *options]
+            assembling = machine.assembler if source is listing else ""
+            compiling = [assembling or compiler, *machine.flags, *options]
             if not object_folder:
                 name = f"{n}-{source.stem}.o"
             elif blobs and source is listing:
@@ -184,6 +191,11 @@ def build(
         collect = ["-Wl,--gc-sections"] if machine.run else []
         command = [compiler, *machine.flags, *source_flags, *collect, *inputs, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
+        if machine.emulator:
+            code, *words = machine.emulator
+            emulator = out_dir / Path(code).stem
+            _compile(["gcc", "-O2", str(RUNTIME / code), "-o", str(emulator), *words], Path(work), code)
+            machine = replace(machine, run=(str(emulator),))
     return Program(machine, file, tuple(objects[: len(sources)]))
 
 

@@ -172,6 +172,27 @@ def test_accelerations_by_their_names_have_one_range(tmp_path: Path, axes: tuple
     assert sum("is guessed (±" in doubt for doubt in guess.doubts) == 1
 
 
+@pytest.mark.parametrize("axes", [("x_gyro", "y_gyro", "z_gyro"), ("gx", "gy", "gz"), ("GyroX", "GyroY", "GyroZ")])
+def test_the_axes_of_a_gyroscope_are_a_vector(tmp_path: Path, axes: tuple[str, ...]) -> None:
+    for seed, (person, gesture) in enumerate((p, g) for p in ("P1", "P2") for g in GESTURES):
+        values = {axis: noise(60, seed + k) for k, axis in enumerate(("ax", "ay", "az", *axes))}
+        touches(tmp_path / "src" / person / f"{gesture}.csv", seed, 60, **values)
+    found, *_ = guessed(tmp_path / "src")
+    assert found["layout"]["vectors"] == [["ax", "ay", "az"], [axis.lower() for axis in axes]]
+    assert {c["kind"] for c in found["layout"]["channels"] if c["name"][-2:] != "ft"} == {
+        "acceleration",
+        "angular rate",
+    }
+
+
+def test_a_row_that_may_be_a_whole_recording_is_a_doubt(tmp_path: Path) -> None:
+    columns = {f"C{k}": noise(40, k) for k in range(1, 31)}
+    people = {"person": [f"P{k % 4}" for k in range(40)], "gesture": [GESTURES[k % 2] for k in range(40)]}
+    table(tmp_path / "src" / "trials.csv", people | columns)
+    _, guess, _ = guessed(tmp_path / "src")
+    assert any("the 30 columns from 'c1' to 'c30'" in d and "a row for each sample" in d for d in guess.doubts)
+
+
 def test_cells_of_files_with_other_columns_are_not_used(tmp_path: Path) -> None:
     for seed, person in enumerate(("P1", "P2", "P3")):
         touches(tmp_path / "src" / person / "touch.csv", seed, 60, gesture=["hug"] * 30 + ["tap"] * 30)

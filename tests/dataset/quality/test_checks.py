@@ -268,6 +268,18 @@ def overlapping(folder: Path) -> str:
     return new.relative_to(folder / "recordings").with_suffix("").as_posix()
 
 
+def of_two_devices(folder: Path) -> str:
+    """Add what another device recorded of the same touch, in a session of its own."""
+    path = recording(folder)
+    frames = read_recording(path, PLUSH).frames
+    other = Frames(frames.values[::-1].copy(), frames.device_ms - frames.device_ms[0], frames.host_ms)
+    assert other.host_ms is not None
+    target = path.parent / "watch" / recording_filename("Head stroke 1", int(other.host_ms[-1]), len(other))
+    target.parent.mkdir()
+    target.write_text(format_header(PLUSH) + format_rows(other, PLUSH), newline="\n")
+    return target.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
 def missing(folder: Path) -> str:
     recording(folder).unlink()
     (folder / "index.json").unlink(missing_ok=True)
@@ -344,6 +356,7 @@ PLANTS: list[tuple[str, str, Plant]] = [
     ("duplicate", "recording", duplicate),
     ("duplicate", "rows", copied_inside),
     ("overlap", "rows", overlapping),
+    ("overlap", "devices", of_two_devices),
     ("missing", "recording", missing),
     ("several-gestures", "two", two_in_one),
     ("no-onset", "rest", of_the_stream(5, 295)),

@@ -21,7 +21,7 @@ from plushsense.core.errors import BadInput, ConfigError, ToolError
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.deploy.golden import EVENT, FAULT, HEALTH, PATCH, TRACKING, answers_of, column
+from plushsense.deploy.golden import EVENT, FAULT, HEALTH, PATCH, TRACKING, Vectors, answers_of, column
 from plushsense.deploy.package import ARDUINO, IDF, SKETCH
 from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.scenarios import scenarios_of
@@ -40,7 +40,7 @@ from support.requirements import LONG
 
 pytestmark = pytest.mark.early
 
-EMULATED = [name for name in TARGETS if name != "host"]
+EMULATED = [name for name, target in TARGETS.items() if name != "host" and not target.slow]
 
 
 def eight() -> Layout:
@@ -64,7 +64,8 @@ def emulators(target_here: Callable[[str], str]) -> None:
 
 
 def plainly(setting: Setting) -> bool:
-    return setting.optimise == "-O2" and setting.cc in (None, "gcc") and not setting.image and not setting.cpp
+    usual = setting.optimise == TARGETS[setting.target].optimise[0]
+    return usual and setting.cc in (None, "gcc") and not setting.image and not setting.cpp
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any], str]:
@@ -184,6 +185,24 @@ def test_the_same_on_every_chip(emulators: None, tmp_path: Path, name: str, monk
     tracking = column(export.golden.answers, "state")
     assert tracking.sum() > 100 and (tracking == 0).sum() > 100
     assert {r.vectors for r in done.runs} == {sum(c.answers for c in done.counts)}
+
+
+def begun(vectors: Vectors, frames: int) -> Vectors:
+    """The first frames of vectors, and their answers."""
+    few = vectors.answers[vectors.answers[:, 1] < frames]
+    silences = tuple(at for at in vectors.silences if at < frames)
+    return replace(vectors, frames=vectors.frames[:frames], answers=few, silences=silences)
+
+
+def test_ints_of_16_bits(target_here: Callable[[str], str], small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The beginnings of the golden vectors and of a scenario, on AVR; all of them when somebody names it."""
+    export = Export(small)
+    export.golden, scenario = begun(export.golden, 800), begun(export.scenarios()[0], 600)
+    monkeypatch.setattr(Export, "scenarios", lambda export: [scenario])
+    done = verify(export, [target_here("avr")])
+    assert done.passed and done.first is None and done.decisions > 50
+    assert [r.vectors for r in done.runs] == [sum(c.answers for c in done.counts)]
+    assert [c.name for c in done.counts] == ["golden", "scenario", "patch"]
 
 
 # ---- It notices ----------------------------------------------------------------------------------------------------

@@ -36,6 +36,11 @@ _IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", 
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
 # acc_x, x_acc, accX, aX, Accelerometer_x, and x, y, z alone; not accuracy.
 _ACCELERATION = re.compile(r"(?<![a-z])(acc(?!u)|accel|a_?[xyz](?![a-z]))|acc(el)?_?[xyz]?$|^[xyz](_\d+)?$")
+_RATE = "angular rate"
+_ANGULAR = re.compile(
+    r"(?<![a-z])(gyro(scope)?|gyr|angular|rotation_?rate)(?![a-z])|(?<![a-z])(gyro?|g)_?[xyz](?![a-z])"
+)
+_MANY_COLUMNS = 20
 _AXES = ({"x", "y", "z"}, {"0", "1", "2"})
 _NO_CHANNEL = re.compile(r"index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#", re.IGNORECASE)
 _TAKE = re.compile(r"(^|_)(id|sample|take|trial|rep|repetition|recording|segment|window|block|session)", re.IGNORECASE)
@@ -167,6 +172,26 @@ def _channels(columns: Sequence[SampledColumn], guess: PatternDraft) -> None:
         listed = ", ".join(sorted(missing))
         guess.doubt("the words {listed} are taken for missing values", "channels", listed=listed)
     _vectors(guess)
+    _doubt_wide(guess)
+
+
+def _doubt_wide(guess: PatternDraft) -> None:
+    """Add a doubt about numbered columns in a table without a clock, which may be the samples of one recording."""
+    series: dict[str, list[tuple[int, str]]] = {}
+    for channel in guess.channels:
+        if numbered := re.fullmatch(r"(.*?)_?(\d+)", channel["name"]):
+            series.setdefault(numbered[1], []).append((int(numbered[2]), channel["name"]))
+    for columns in series.values():
+        columns.sort()
+        if not guess.times and len(columns) >= _MANY_COLUMNS and columns[-1][0] - columns[0][0] < len(columns):
+            guess.doubt(
+                "the {n} columns from '{first}' to '{last}' are taken for channels: if they are the samples of one "
+                "channel, so that each row is a whole recording, write a table with a row for each sample",
+                "channels",
+                n=len(columns),
+                first=columns[0][1],
+                last=columns[-1][1],
+            )
 
 
 def _may_be_channels(left: list[SampledColumn], guess: PatternDraft) -> list[SampledColumn]:
@@ -382,49 +407,52 @@ def _measured(column: SampledColumn, guess: PatternDraft) -> dict[str, Any]:
     values = column.values
     texts = [cell.strip().replace(",", ".") for cell in column.cells]
     digits = min(6, max((len(t.partition(".")[2]) for t in texts if is_number(t) and "e" not in t.lower()), default=0))
-    is_acceleration = _ACCELERATION.search(name) is not None
-    if set(values.tolist()) <= {0.0, 1.0} and not digits and not is_acceleration:
+    kind = _RATE if _ANGULAR.search(name) else "acceleration" if _ACCELERATION.search(name) else "sensor"
+    if set(values.tolist()) <= {0.0, 1.0} and not digits and kind == "sensor":
         return _channel(name, "binary", valid_min=0, valid_max=1)
     # Whole numbers of steps have to fit 32 bits, and the square of a magnitude of three axes 64.
     while digits and np.abs(values).max() * 10**digits > _MOST_STEPS:
         digits -= 1
     more: dict[str, Any] = {"step": float(f"1e-{digits}")} if digits else {}
-    if is_acceleration:
+    if kind != "sensor":
         # A magnitude needs a range; twice the largest value is a guess at that of the sensor.
         limit = float(2 ** int(np.ceil(np.log2(max(2 * np.abs(values).max(), 1.0)))))
-        return _channel(name, "acceleration", **more, valid_min=-limit, valid_max=limit)
-    return _channel(name, "sensor", **more)
+        more |= {"valid_min": -limit, "valid_max": limit}
+    return _channel(name, kind, **more)
 
 
 def _vectors(guess: PatternDraft) -> None:
-    """Find triples of accelerations whose names differ only in x, y and z, or that are a list of three in JSON."""
+    """Find triples of accelerations or rates whose names differ only in x, y and z, or that are a list in JSON."""
     by_stem: dict[str, dict[str, str]] = {}
     for channel in guess.channels:
         text = channel["name"].replace("_", " ")
-        axis = re.search(r"(?:(?<![a-z])a?|acc|accel)([xyz])(?![a-z])|([xyz])$", text)
-        if channel["kind"] == "acceleration" and axis is not None and (at := axis.lastindex):
+        axis = re.search(r"(?:(?<![a-z])[ag]?|acc|accel|gyro?)([xyz])(?![a-z])|([xyz])$", text)
+        if channel["kind"] == "sensor":
+            continue
+        if axis is not None and (at := axis.lastindex):
             stem = channel["name"][: axis.start(at)] + "?" + channel["name"][axis.end(at) :]
             by_stem.setdefault(stem, {})[axis[at]] = channel["name"]
-        elif (
-            channel["kind"] == "acceleration"
-            and guess.is_json
-            and (item := re.fullmatch(r"(.+_)(\d+)", channel["name"]))
-        ):
+        elif guess.is_json and (item := re.fullmatch(r"(.+_)(\d+)", channel["name"])):
             by_stem.setdefault(item[1], {})[item[2]] = channel["name"]
     guess.vectors = [[axes[a] for a in sorted(axes)] for axes in by_stem.values() if set(axes) in _AXES]
+    for channel in guess.channels:
+        if channel["kind"] == _RATE and not any(channel["name"] in vector for vector in guess.vectors):
+            # A single letter may stand for something else.
+            channel["kind"] = "sensor"
+            del channel["valid_min"], channel["valid_max"]
     _ranges(guess)
 
 
 def _ranges(guess: PatternDraft) -> None:
     """Give the axes of one vector the same range, the largest of theirs, and the same step."""
-    accelerations = {c["name"]: c for c in guess.channels if c["kind"] == "acceleration"}
-    alone = [[name] for name in accelerations if not any(name in vector for vector in guess.vectors)]
+    axes = {c["name"]: c for c in guess.channels if "valid_min" in c and c["kind"] != "binary"}
+    alone = [[name] for name in axes if not any(name in vector for vector in guess.vectors)]
     for names in [*guess.vectors, *alone]:
-        limit = max(accelerations[name]["valid_max"] for name in names)
-        step = min(accelerations[name].get("step", 1.0) for name in names)
+        limit = max(axes[name]["valid_max"] for name in names)
+        step = min(axes[name].get("step", 1.0) for name in names)
         for name in names:
-            accelerations[name] |= {"step": step} if step < 1.0 else {}
-            accelerations[name] |= {"valid_min": -limit, "valid_max": limit}
+            axes[name] |= {"step": step} if step < 1.0 else {}
+            axes[name] |= {"valid_min": -limit, "valid_max": limit}
         listed = ", ".join(f"'{name}'" for name in names)
         guess.doubt(
             "the range of {listed} is guessed (±{limit:g}): give that of the sensor",

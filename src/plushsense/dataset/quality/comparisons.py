@@ -39,6 +39,8 @@ _RAIL = 0.99
 _ALIKE = 3
 _OFTEN = 0.04
 _OVERLAP = 0.1
+_TOGETHER = 0.5
+_WALL_CLOCK_MS = 1e11
 _MADE_BY = 0.9
 _AGREE = 0.6
 # The rest before the gestures tells them if it names this share of them right, and so much more than guessing.
@@ -469,6 +471,27 @@ def overlap(w: DatasetSummary) -> Iterator[Issue]:
                 )
         if open_at is None or open_at[0] != now[0] or now[2] > open_at[2]:
             open_at = now
+    yield from _at_one_time(w)
+
+
+def _at_one_time(w: DatasetSummary) -> Iterator[Issue]:
+    """Find recordings during which, by the wall clock, the same person also made one in another session."""
+    people: dict[str, list[tuple[float, float, tuple[str, str], str]]] = {}
+    for o in w.recordings:
+        if isinstance(o.info, RecordingInfo) and o.info.epoch_ms > _WALL_CLOCK_MS and o.info.subject != UNKNOWN_SUBJECT:
+            place = o.info.session, o.info.stream
+            end_ms = o.info.epoch_ms + 1000 * o.info.whole_seconds
+            people.setdefault(o.info.subject, []).append((o.info.epoch_ms, end_ms, place, o.info.id))
+    for own in people.values():
+        latest: dict[tuple[str, str], tuple[float, str]] = {}
+        for start, end, place, identity in sorted(own):
+            for other_place, (other_end, other) in latest.items():
+                shared = min(end, other_end) - start
+                if other_place != place and shared > _TOGETHER * (end - start):
+                    template = "made at the same time as {other}, by the clock ({seconds:.1f} s): two devices?"
+                    yield Issue(Message(template, other=other, seconds=shared / 1000), about=identity)
+                    break
+            latest[place] = max(latest.get(place, (0.0, "")), (end, identity))
 
 
 def _people(w: DatasetSummary) -> dict[str, Counter[str]]:

@@ -17,7 +17,8 @@
  *
  * PLUSH_HARNESS_CHANNELS and PLUSH_HARNESS_CLASSES say of how many the frames and the expected rows are,
  * PLUSH_HARNESS_MEMORY_BYTES how much memory the cases' own models need.
- * Cases are in memory, and rows go to target_write(). With PLUSH_HARNESS_DEVICE both go over a UART (plush_device.c), and
+ * Cases are in memory, and rows go to target_write(). With PLUSH_HARNESS_KEPT_BYTES cases come from target_read(), at whose
+ * end the program ends: there is room for so many bytes of models and patches. With PLUSH_HARNESS_DEVICE both go over a UART (plush_device.c), and
  * it is measured how long plush_push() takes.
  * With PLUSH_HARNESS_IMAGE the export's model is not the one compiled in (plush_model.c) but the bytes of
  * plush_model.bin, as when a model is swapped without compiling the code again; with PLUSH_HARNESS_BOTH too they must be
@@ -45,6 +46,7 @@ enum { END = 0, SILENCE = 1, PATCH = 2 };
 extern "C" {
 #endif
 void target_write(const void *bytes, uint32_t n);
+void target_read(void *bytes, uint32_t n);
 extern const uint8_t cases[], cases_end[];
 #ifdef PLUSH_HARNESS_IMAGE
 extern const uint8_t image[], image_end[];
@@ -53,6 +55,27 @@ extern const uint8_t image[], image_end[];
 }
 #endif
 
+#ifdef PLUSH_HARNESS_KEPT_BYTES
+static uint8_t room[PLUSH_HARNESS_KEPT_BYTES + 1u] __attribute__((aligned(4)));
+static uint32_t kept;
+
+static int plush_device_case(void)
+{
+    kept = 0;
+    return 1;
+}
+
+static const uint8_t *plush_device_bytes(uint32_t n, int keep)
+{
+    static uint8_t passing[4u * (1u + PLUSH_HARNESS_CHANNELS)];
+    uint8_t *bytes = keep ? room + kept : passing;
+
+    if (keep)
+        kept += n;
+    target_read(bytes, n);
+    return bytes;
+}
+#else
 static const uint8_t *next = cases;
 
 static int plush_device_case(void)
@@ -69,6 +92,7 @@ static const uint8_t *plush_device_bytes(uint32_t n, int kept)
     next += n;
     return bytes;
 }
+#endif
 
 static void plush_device_row(const uint8_t *bytes, uint32_t n)
 {

@@ -39,6 +39,8 @@
 #endif
 #ifndef PLUSH_CONST
 #define PLUSH_CONST
+#elif defined(__AVR__) || (defined(ESP8266) && !defined(NON32XFER_HANDLER))
+#error "The library reads constants with plain loads of bytes, which cannot read this chip's flash: leave out PLUSH_CONST."
 #endif
 
 /* What a model may ask for, so that every sum, size and address below is sure to fit. */
@@ -689,7 +691,7 @@ PLUSH_SMALL static int has_gate(const plush_toy *toy)
 /* How many rows a phase has room for. */
 static uint32_t phase_rows(const plush_layer *layer)
 {
-    return layer->kernel + SPARE;
+    return (uint32_t)layer->kernel + SPARE; /* an int may have 16 bits */
 }
 
 /* Hands out the memory of a model that was read. Returns the bytes of it. */
@@ -834,13 +836,13 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 #else
 
 /* Keeps a value in a register, and what is done to it in the written order: otherwise compilers add products up in trees,
- * for which small cores have too few registers. */
+ * for which small cores have too few registers. (clang gives no number of 32 bits to a register of AVR.) */
 #if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__) && defined(__OPTIMIZE__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
 /* Eight registers multiply, and the others can be added to. */
 #define PLUSH_ADD(s, v) __asm__ volatile("add %0, %1" : "+h"(s) : "l"(v))
 #define PLUSH_NEXT_WORD(v) __asm__ volatile("ldmia %0!, {%1}" : "+l"(w), "=l"(v) : : "memory")
-#elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
+#elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__) && !(defined(__AVR__) && defined(__clang__))
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
 #else
 #define PLUSH_KEEP(v) ((void)0)
@@ -853,6 +855,27 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
     } while (0)
 #define PLUSH_NEXT_WORD(v) ((v) = aligned_le32(w), w += 4)
 #endif
+#ifdef __AVR__
+/* A product of two bytes fits an int without sign of 16 bits, which is quicker than fewer products of 32. */
+#define PLUSH_EACH
+#define PLUSH_SUMS(s) uint32_t s##0 = 0, s##1 = 0, s##2 = 0, s##3 = 0
+#define PLUSH_GIVE(s, sum)   \
+    do {                     \
+        (sum)[0] = s##0;     \
+        (sum)[1] = s##1;     \
+        (sum)[2] = s##2;     \
+        (sum)[3] = s##3;     \
+    } while (0)
+#define PLUSH_CHANNEL(i)                          \
+    do {                                          \
+        unsigned a = x[i];                        \
+        PLUSH_ADD(s0, a * w[0]);                  \
+        PLUSH_ADD(s1, a * w[1]);                  \
+        PLUSH_ADD(s2, a * w[2]);                  \
+        PLUSH_ADD(s3, a * (w[3] ^ WEIGHT_ZERO));  \
+        w += 4;                                   \
+    } while (0)
+#else
 #define PLUSH_HIGH(v) bits_of(shift_down(as_signed(v), 16))
 #define PLUSH_CHANNEL(i)            \
     do {                            \
@@ -865,6 +888,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         a *= v;                     \
         PLUSH_ADD(s0, a);           \
     } while (0)
+#endif
 #define PLUSH_ALONE       \
     do {                  \
         PLUSH_CHANNEL(0); \
@@ -873,6 +897,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         PLUSH_CHANNEL(3); \
         x += 4;           \
     } while (0)
+#ifndef __AVR__
 #if defined(__thumb__) && !defined(__thumb2__)
 /* A product takes the place of a factor: in this order, one more copy is enough. */
 #define PLUSH_CHANNEL_OF_PAIR(i)    \
@@ -932,6 +957,8 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 
 #endif
 
+#endif
+
 #ifndef PLUSH_SUMS
 #define PLUSH_SUMS(s) uint32_t s##0 = 0, s##1 = 0, s##2 = 0
 #define PLUSH_GIVE(s, sum)   \
@@ -947,10 +974,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
         (s) += two * 0x10001u >> 16;                                               \
     } while (0)
-#define PLUSH_LIMIT(v, bits)           \
-    do {                               \
-        if ((v) >> (bits) != 0)        \
-            (v) = (1u << (bits)) - 1u; \
+#define PLUSH_LIMIT(v, bits)                     \
+    do {                                         \
+        if ((v) >> (bits) != 0)                  \
+            (v) = (UINT32_C(1) << (bits)) - 1u;  \
     } while (0)
 #endif
 
@@ -1023,6 +1050,7 @@ static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32
 PLUSH_APART
 static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const uint8_t *w, uint32_t sum[2 * GROUP])
 {
+#ifdef PLUSH_PAIR
     PLUSH_SUMS(s);
     PLUSH_SUMS(t);
 
@@ -1031,6 +1059,10 @@ static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const u
     while (x != end);
     PLUSH_GIVE(s, sum);
     PLUSH_GIVE(t, sum + GROUP);
+#else
+    alone(x, end, w, sum);
+    alone(y, y + (end - x), w, sum + GROUP);
+#endif
 }
 
 /* ReLU, and a sum to 8 bits; rounded half up, also where `after` is 0. */
@@ -1986,7 +2018,7 @@ PLUSH_SMALL static void forget(plush_toy *toy)
 {
     uint32_t phase;
 
-    memset(toy->memory, 0, toy->memory_bytes);
+    memset(toy->memory, 0, (size_t)toy->memory_bytes);
     toy->waiting = 0;
     toy->heard = toy->running = 0;
     toy->block = toy->gate_deaf = 0;

@@ -40,7 +40,7 @@ from plushsense.runtime.image import IntegerModel
 
 _LOW, _HIGH = -(1 << 31), (1 << 31) - 1
 _PAUSE_MS = 1000
-_SLOWEST_MACS_S = 2e6  # multiply-accumulates that an emulator does in a second, on a busy computer
+_SLOWEST_MACS_S = 2e5  # multiply-accumulates that an emulator does in a second, on a busy computer
 
 
 def recorded_frames(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (), rows: int) -> Ints:

@@ -62,7 +62,7 @@ class Setting:
 def settings_of(target: str) -> list[Setting]:
     """Return the compiler settings to verify on a target."""
     if target != "host":
-        return [Setting(target, optimise=o) for o in ("-O2", "-Os")]
+        return [Setting(target, optimise=o) for o in TARGETS[target].optimise]
     settings = [Setting(target, cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")]
     settings += [Setting(target, cc, "-O1", (*STRICT, *SANITIZERS)) for cc in ("gcc", "clang")]
     # C++ has no -std=c99, and exceptions would need its library.
@@ -172,7 +172,7 @@ def verify(
 
     Args:
         export: the folder.
-        targets: names of `TARGETS`; empty: all whose tools are installed.
+        targets: names of `TARGETS`; empty: all whose tools are installed, but no slow ones.
         vectors: further vectors to run.
         only: which settings of a target to run.
         trust: also compile and run C and model files that differ from what this version writes, and verify a folder
@@ -209,6 +209,9 @@ def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[li
     runnable: list[Setting] = []
     not_run: list[tuple[str, str]] = []
     for name in dict.fromkeys(targets or TARGETS):
+        if TARGETS.get(name) and TARGETS[name].slow and not targets:
+            not_run.append((name, Message("it takes minutes, and only runs when it is named")))
+            continue
         settings = [s for s in settings_of(target_named(name).name) if only(s)]
         lacks = {s: _lacks(s) for s in settings}
         here = [s for s in settings if not lacks[s]]
@@ -306,6 +309,7 @@ class _Runner:
         A program that reads plush_model.bin also checks that plush_model.c holds the same bytes.
         """
         stream, path = cases
+        reads = bool(TARGETS[setting.target].emulator)
         labels = self.export.labels
         names = " and ".join(dict.fromkeys(v.name for v in stream))
         where = f"On {setting.target} ({setting.compiler} {setting.options}), {names}"
@@ -315,6 +319,7 @@ class _Runner:
             "PLUSH_HARNESS_CLASSES": len(labels),
             "PLUSH_HARNESS_MEMORY_BYTES": self.memory_bytes,
             **({"PLUSH_HARNESS_IMAGE": 1, "PLUSH_HARNESS_BOTH": 1} if setting.image else {}),
+            **({"PLUSH_HARNESS_KEPT_BYTES": max(v.kept_bytes for v in stream)} if reads else {}),
         }
         # Compile a copy, because next to the original the compiler would find PlushSense's own plushsense.h. The
         # definitions are in the copy, so that the other sources are compiled only once for all streams.
@@ -327,11 +332,12 @@ class _Runner:
             out,
             CompileSpec(setting.cc, setting.optimise, setting.flags),
             include=[self.code],
-            blobs={"cases": path, **({"image": self.code / IMAGE} if setting.image else {})},
+            blobs={**({} if reads else {"cases": path}), **({"image": self.code / IMAGE} if setting.image else {})},
             object_folder=self.objects,
         )
         try:
-            got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream) + self.export.seconds(stream))
+            timeout_s = 60 + 0.02 * sum(len(v.frames) for v in stream) + self.export.seconds(stream)
+            got = program.run(timeout_s=timeout_s, given=path if reads else None)
         except ProgramError as cause:
             return RowComparison(len(expected), len(expected), 0, f"{where}: {cause}")
         result = compare(expected, got, labels)

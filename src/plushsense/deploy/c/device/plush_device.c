@@ -61,7 +61,7 @@ static void send_words(char letter, const char *words)
 {
     uint32_t n = (uint32_t)strlen(words);
 
-    memcpy(out + HEAD_BYTES, words, n);
+    memcpy(out + HEAD_BYTES, words, (size_t)n);
     send(letter, n);
 }
 
@@ -118,7 +118,7 @@ static void greet(void)
     for (i = 0; i < 6; i++)
         to = put(to, numbers[i]);
     i = (uint32_t)strlen(plush_hook_counter);
-    memcpy(to, plush_hook_counter, i);
+    memcpy(to, plush_hook_counter, (size_t)i);
     send('h', 4u * 6u + i);
 }
 
@@ -186,7 +186,7 @@ const uint8_t *plush_device_bytes(uint32_t n, int keep)
         if (broken || (taken == filled && !more()))
             return NULL;
         got = n < filled - taken ? n : filled - taken;
-        memcpy(to, in + HEAD_BYTES + taken, got);
+        memcpy(to, in + HEAD_BYTES + taken, (size_t)got);
         to += got;
         taken += got;
         n -= got;
@@ -202,7 +202,7 @@ void plush_device_row(const uint8_t *bytes, uint32_t n)
         got = PLUSH_DEVICE_MOST_BYTES - written;
         if (got > n)
             got = n;
-        memcpy(out + HEAD_BYTES + written, bytes, got);
+        memcpy(out + HEAD_BYTES + written, bytes, (size_t)got);
         written += got;
         if (written == PLUSH_DEVICE_MOST_BYTES)
             send_rows();

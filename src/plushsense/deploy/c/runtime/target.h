@@ -14,6 +14,9 @@ extern "C" {
 /* Appends these bytes to standard output, as they are. */
 void target_write(const void *bytes, uint32_t n);
 
+/* The next bytes of standard input; at its end the program ends. Only on AVR, which has no memory for blobs. */
+void target_read(void *bytes, uint32_t n);
+
 /* Instructions since the start, modulo 2^32; two differ by what ran between them. 0 where nothing counts (host).
  * Ask at least once in 2^30 instructions. */
 uint32_t target_instructions(void);

@@ -247,7 +247,7 @@ class VerificationCard:
             with ui.expansion(words("More settings")).classes("w-full"):
                 with ui.row().classes("w-full"):
                     for name in (n for n, packages in missing.items() if not packages):
-                        self._chosen[name] = ui.checkbox(self._title(name), value=True)
+                        self._chosen[name] = ui.checkbox(self._title(name), value=not TARGETS[name].slow)
                         tag(self._chosen[name], f"target-{name}")
                 for name, packages in missing.items():
                     if packages:
