@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import itertools
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,13 +24,15 @@ from plushsense.dataset.importing.matfile import read_mat, texts_of
 from plushsense.deploy.convert import ConversionJob, compared, convert, describe, made_up_windows
 from plushsense.deploy.convert import onnx as as_onnx
 from plushsense.deploy.convert import tflite as as_tflite
-from plushsense.deploy.quantize import calibrated, integer_network
+from plushsense.deploy.package import emit
+from plushsense.deploy.quantize import calibrated, integer_model, integer_network
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
 from plushsense.runtime.integer import deployable
 from plushsense.windows.features import InputUnits, Scaler, network_inputs
 from support.exports import bundle_of
+from support.requirements import missing
 
 # symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
 NETS: list[tuple[str, tuple[int, ...], str, dict[str, Any]]] = [
@@ -181,6 +186,44 @@ def test_the_evaluator_of_onnx_gives_the_same_answers(net: Any, onnx_here: None)
     raw = others(bundle, 3)
     (found,) = ReferenceEvaluator(as_onnx.float_model(bundle)).run(["logits"], {"raw": values(bundle, raw)})
     assert_floats(found, bundle, raw)
+
+
+def _reader(module: str) -> Any:
+    if importlib.util.find_spec(module) is None:
+        missing("readers", f"{module} is not installed")
+    return importlib.import_module(module)
+
+
+def _by_openvino(path: Path, x: Any) -> Any:
+    openvino = _reader("openvino")
+    compiled = openvino.Core().compile_model(path, "CPU")
+    return compiled({"raw": x})["logits"]
+
+
+def _by_opencv(path: Path, x: Any) -> Any:
+    cv2 = _reader("cv2")
+    # Its new engine gives arbitrary numbers for a kernel of 9 taps (docs/deploy.md).
+    net = cv2.dnn.readNetFromONNX(str(path), cv2.dnn.ENGINE_CLASSIC)
+    rows = []
+    for window in x:  # of a vector layer it refuses several at once
+        net.setInput(window[None])
+        rows.append(net.forward("logits")[0].copy())
+    return np.stack(rows)
+
+
+@pytest.mark.parametrize("reader", [_by_openvino, _by_opencv])
+@pytest.mark.parametrize("symbol", ["9d1_5d2", "v9_5d2"])
+def test_readers_of_others_give_the_answers_of_the_network(
+    symbol: str, reader: Callable[[Path, Any], Any], tmp_path: Path, onnx_here: None
+) -> None:
+    """Of the files of an export."""
+    bundle = bundle_of("plush-15", symbol, "4,6", window=60)
+    out = emit(integer_model(bundle), bundle, tmp_path / "out", also=("onnx", "onnx-int8")).folder
+    raw = others(bundle)[:-1]
+    assert_floats(reader(out / "model.onnx", values(bundle, raw)), bundle, raw)
+    expected = integer_network(bundle).forward(raw) / 256
+    found = reader(out / "model.int8.onnx", values(bundle, raw))
+    assert np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
 
 
 def test_onnxruntime_infers_the_shapes_of_vector_networks(onnx_here: None) -> None:

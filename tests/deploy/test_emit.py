@@ -14,7 +14,7 @@ import pytest
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import GestureSet
 from plushsense.core.templates import c_comment
-from plushsense.deploy.code import TOY_BYTES, c_names, read_facts
+from plushsense.deploy.code import TOY_BYTES, RestFacts, c_names, read_facts
 from plushsense.deploy.golden import answers_of, column, golden_frames, read_golden
 from plushsense.deploy.package import emit
 from plushsense.deploy.quantize import integer_model
@@ -162,3 +162,21 @@ def test_no_export_is_refused(tmp_path: Path) -> None:
     (tmp_path / "export.json").write_text("{}")
     with pytest.raises(BadInput, match="lacks channels, classes"):
         read_facts(tmp_path)
+
+
+def test_what_is_known_of_an_accelerometer_is_a_sentence() -> None:
+    axes = ("x", "y", "z")
+    found = [
+        RestFacts(axes, 7948, 7948.0, "count", (4, -56, 42)),
+        RestFacts(axes, 2_000_000, 2_000_000.0, "count", (0, 500_000, 0), is_estimated=True),
+        RestFacts(axes, 9807, 9.807, "m/s²"),
+        RestFacts(axes),
+    ]
+    assert [rest.sentence for rest in found] == [
+        "at rest |x, y, z| is about 7,948 counts",
+        "at rest |x, y, z| around 0, 500000, 0 is about 2,000,000 counts; estimated, as the recordings do not "
+        "determine it",
+        "at rest |x, y, z| is about 9.807 m/s²",
+        "what |x, y, z| reads at rest, so its scale, is not known: the bundle is of an earlier PlushSense or trained "
+        "on arrays; export --dataset DS measures it",
+    ]

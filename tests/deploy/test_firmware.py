@@ -150,6 +150,7 @@ def test_another_scale_is_noticed_at_rest_only(tmp_path: Path, c_compiler: str) 
 def test_a_bundle_of_before_exports_and_says_that_the_scale_is_not_known(packages: Packages) -> None:
     for layout, (out, _) in packages.items():
         text, header = (out / "README.md").read_text(encoding="utf-8"), (out / "plush_model.h").read_text()
+        assert "standard deviation" not in (out / SKETCH / "plush_fake.c").read_text(encoding="utf-8")
         assert text.count("export --dataset DS measures it") == 1 and "PLUSH_MODEL_ONE_G" not in header
         assert ("ITS SCALE IS NOT KNOWN" in (out / SKETCH / "PlushToy.ino").read_text()) == (layout != "phone-6")
 

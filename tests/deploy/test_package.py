@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +21,7 @@ from plushsense.deploy.proof.vectors import Export
 from plushsense.runtime.image import IntegerModel, image_check
 from plushsense.workflow.export import PackageNames, export
 from support.exports import bundle_of
+from support.requirements import missing
 from support.virtual_boards import WARNINGS, run
 
 REPO = Path(__file__).resolve().parents[2]
@@ -226,9 +229,16 @@ def test_the_component_is_found_whatever_its_folder_is_called(packages: Packages
             assert words[0] == "acme__ears"
             drivers = ["esp_driver_i2c", "esp_driver_ledc", "esp_driver_uart"] if major > 5 else ["driver"]
             assert example == "RtosToy" or words[1:] == [*drivers, "esp_timer"]
-    for tool in filter(None, [shutil.which("compote")]):
-        run(tool, "manifest", "lint", component)
-        run(tool, "component", "pack", "--name", "ears", "--project-dir", component, "--dest-dir", tmp_path / "dist")
+
+
+def test_the_component_manager_checks_and_packs_it(packages: Packages, tmp_path: Path) -> None:
+    places = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+    if (compote := shutil.which("compote", path=places)) is None:
+        missing("readers", "idf-component-manager is not installed")
+    component = Path(shutil.copytree(packages["plush-15"][0] / IDF, tmp_path / "component"))
+    run(compote, "manifest", "lint", component)
+    run(compote, "component", "pack", "--name", "ears", "--project-dir", component, "--dest-dir", tmp_path / "dist")
+    assert [p.suffix for p in (tmp_path / "dist").iterdir() if p.is_file()] == [".tgz"]
 
 
 def test_the_model_s_own_version_and_page_stand_in_every_manifest_and_in_c(tmp_path: Path, c_compiler: str) -> None:

@@ -85,7 +85,7 @@ def test_a_sensor_of_another_scale_and_rate_gets_the_names_of_the_computer(
     t = np.arange(int(36 * RATE_HZ) // BURST * BURST) / RATE_HZ
     counts = np.rint(moved(t) * WIRED).astype("<i2")
     # An interrupt comes with the last reading of a burst.
-    stamps = np.floor(t[BURST - 1 :: BURST] * 1000).astype(np.int64)
+    stamps = np.floor(t[BURST - 1 :: BURST] * 1000).astype(np.int64) + 1000
     pieces = zip(stamps.tolist(), counts.reshape(-1, BURST, 3), strict=True)
     fifo = b"".join(np.array([ms, BURST], dtype="<u4").tobytes() + burst.tobytes() for ms, burst in pieces)
     program = tmp_path / "wired"
@@ -93,13 +93,13 @@ def test_a_sensor_of_another_scale_and_rate_gets_the_names_of_the_computer(
     run(c_compiler, "-std=c99", *WARNINGS, f"-I{out}", *sources, "-o", program)
     done = subprocess.run([program], input=fifo, capture_output=True, check=True)
 
-    ms = (stamps[:, None] - np.arange(BURST)[::-1] * 9_615_385 // 1_000_000).ravel()
+    ms = (stamps[:, None] - (np.arange(BURST)[::-1] * 9615 + 999) // 1000).ravel()
     read = np.trunc(counts.astype(np.int64) * known.steps / WIRED).astype(np.int64) + known.zero
     expected = named(model, np.column_stack([ms, read]))
     assert done.stdout.decode().splitlines() == expected
     assert {line.split()[1] for line in expected} == set(GESTURES)
     even = np.arange(0, t[-1], 0.01)
-    as_recorded = named(model, np.column_stack([np.arange(len(even)) * 10, recorded(moved(even))]))
+    as_recorded = named(model, np.column_stack([np.arange(len(even)) * 10 + int(ms[0]), recorded(moved(even))]))
     unscaled = named(model, np.column_stack([ms, counts.astype(np.int64)]))
     same, other = (np.mean([a == b for a, b in zip(expected, lines, strict=True)]) for lines in (as_recorded, unscaled))
     assert same > 0.97 and other < 0.8, "the same names as at the recordings' own scale and rate, but not unscaled"

@@ -5,8 +5,9 @@
 #include "plush_model.h"
 #include "plushsense.h"
 
-#define SENSOR_ONE_G 16393 /* counts a g, from its data sheet */
-#define PERIOD_NS 9615385u
+#define SENSOR_ONE_G 16393 /* counts a g, and the period, from its data sheet */
+#define PERIOD_US 9615u
+#define MOST 32 /* readings that the FIFO holds */
 
 static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];
 static plush_toy toy;
@@ -22,22 +23,21 @@ static void answered(const plush_toy *of, void *user)
 int main(void)
 {
     uint32_t head[2], i;
-    int16_t counts[3];
+    int16_t counts[MOST][3];
     int32_t values[3];
     int axis;
 
     if (plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory) != PLUSH_OK)
         return 1;
     toy.on_answer = answered;
-    while (fread(head, sizeof head, 1, stdin) == 1)
+    while (fread(head, sizeof head, 1, stdin) == 1) {
+        if (head[1] > MOST || fread(counts, sizeof counts[0], head[1], stdin) != head[1])
+            return 2;
         for (i = 0; i < head[1]; i++) {
-            uint32_t before_ms = (uint32_t)((uint64_t)(head[1] - 1 - i) * PERIOD_NS / 1000000u);
-
-            if (fread(counts, sizeof counts, 1, stdin) != 1)
-                return 2;
             for (axis = 0; axis < 3; axis++)
-                values[axis] = zero[axis] + (int32_t)((int64_t)counts[axis] * PLUSH_MODEL_ONE_G / SENSOR_ONE_G);
-            plush_push(&toy, head[0] - before_ms, values);
+                values[axis] = zero[axis] + (int32_t)((int64_t)counts[i][axis] * PLUSH_MODEL_ONE_G / SENSOR_ONE_G);
+            plush_push(&toy, head[0] - ((head[1] - 1 - i) * PERIOD_US + 999) / 1000, values);
         }
+    }
     return 0;
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,6 +24,14 @@ def plain_label(label: str) -> str:
     Accents are composed (NFC): macOS stores them apart from their letters in names of files.
     """
     return unicodedata.normalize("NFC", " ".join(label.replace("_", " ").split()).casefold())
+
+
+def alike_labels(labels: Iterable[str]) -> list[list[str]]:
+    """Return groups of labels that differ in punctuation and spaces only, as ``Midair 'S'`` and ``Midair _S_``."""
+    groups: dict[str, dict[str, str]] = {}
+    for label in labels:
+        groups.setdefault(re.sub(r"[\W_]+", "", label.casefold()), {}).setdefault(plain_label(label), label)
+    return [sorted(group.values()) for letters, group in groups.items() if letters and len(group) > 1]
 
 
 @dataclass(frozen=True)

@@ -74,15 +74,16 @@ class RestFacts:
         length = f"|{', '.join(self.channels)}|"
         if not self.steps:
             return (
-                f"what {length} reads at rest, so its scale, is not known: the bundle is of an earlier PlushSense; "
-                "export --dataset DS measures it"
+                f"what {length} reads at rest, so its scale, is not known: the bundle is of an earlier PlushSense or "
+                "trained on arrays; export --dataset DS measures it"
             )
         # In a sentence, a small zero would only distract.
         far = math.hypot(*self.zero) > _FAR_ZERO * self.steps
         zero = f" around {join_names(self.zero)}" if far else ""
         unit = "counts" if self.unit == "count" else self.unit
         doubt = "; estimated, as the recordings do not determine it" if self.is_estimated else ""
-        return f"at rest {length}{zero} is about {self.value:,g} {unit}".rstrip() + doubt
+        value = f"{self.value:,.0f}" if self.value >= 100 else f"{self.value:g}"
+        return f"at rest {length}{zero} is about {value} {unit}".rstrip() + doubt
 
 
 @dataclass(frozen=True)

@@ -194,6 +194,7 @@ def handbook(bundle: Bundle, facts: ModelFacts) -> str:
         "templates/README.md",
         facts=facts,
         idf=IDF_SINCE,
+        measured=bundle.readings is not None,
         **_folders(facts.name),
         channels=list(zip(layout.channels, c_names(layout.names), *ranges, strict=True)),
         provenance=bundle.provenance,
@@ -278,6 +279,7 @@ def firmware(layout: Layout, scaler: Scaler, facts: ModelFacts, readings: Readin
         "wire": [names.get(field, field.upper()) for field in layout.wire],
         "kinds": {s.kind for s in sources},
         "one_g": _MPU_ONE_G,
+        "is_measured": readings is not None,
         "rest": [layout.index(name) for rest in facts.rest[:1] if rest.steps for name in rest.channels],
         "channels": [
             {

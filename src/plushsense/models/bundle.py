@@ -116,7 +116,8 @@ class Bundle:
         provenance: origin of the weights: data set hash, subjects, code version, split, scores.
         calibration: value ranges in training windows, for 8-bit scales (``deploy/quantize``); no samples. May be empty.
         personal: for whom the dense layer was adapted, and the layer before (`plushsense.live.adaptation`); or empty.
-        readings: what the sensors read in the training recordings; None: unknown, as in bundles of earlier versions.
+        readings: what the sensors read in the training recordings; None: unknown, as in bundles of earlier versions, or
+            if the training had arrays alone.
 
     Raises:
         BundleError: if the parts do not fit together, or a number is out of range.

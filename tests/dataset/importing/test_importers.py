@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import DatasetError
+from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.dataset.importing.importers import import_recordings
@@ -150,6 +151,21 @@ def test_a_subject_code_cannot_leave_the_folder(tmp_path: Path) -> None:
     outside = [p for p in tmp_path.rglob("Shake*") if "src" not in p.parts]
     assert all((tmp_path / "a" / "DS" / "recordings") in p.parents for p in outside)
     assert outside
+
+
+def test_spellings_of_one_label_are_offered_as_one_gesture(tmp_path: Path) -> None:
+    for person, label in (("P01", "Midair 'S'"), ("P02", "Midair _S_")):
+        (tmp_path / "src" / person).mkdir(parents=True)
+        for epoch in (1000, 2000):
+            write_recording(tmp_path / "src" / person / f"{label}_{epoch}_60.csv", some(60, epoch + len(label)), ACCEL)
+    notes = import_recordings(tmp_path / "src", tmp_path / "DS", layout=ACCEL).messages
+    assert "'Midair 'S'' (2), 'Midair _S_' (2) look like spellings of one gesture" in notes[0]
+    own = GestureSet("own", (Gesture("Midair 'S'", labels=("Midair _S_",)),))
+    done = import_recordings(tmp_path / "src", tmp_path / "DS2", layout=ACCEL, gestures=own)
+    assert done.gestures == ["Midair 'S'"] and not any("spellings" in note for note in done.messages)
+    one = GestureSet("one", (Gesture("Midair 'S'"),))
+    notes = import_recordings(tmp_path / "src", tmp_path / "DS3", layout=ACCEL, gestures=one).messages
+    assert "'Midair 'S'' has  labels = [\"Midair _S_\"]" in notes[0] and "has no gesture 'Midair _S_' (2)" in notes[1]
 
 
 def test_unknown_labels_are_kept_and_said(tmp_path: Path) -> None:

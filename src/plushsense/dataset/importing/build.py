@@ -6,6 +6,7 @@ Raw files are copied unchanged. Existing files, marks and class numbers stay as 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import shutil
 import tempfile
@@ -19,7 +20,7 @@ from filelock import Timeout
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import new_folder, write_file
-from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.gestures import NOBODY, GestureSet, alike_labels
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Message, join_names
 from plushsense.dataset.files import CACHE, sha256_of, walk_files
@@ -328,18 +329,32 @@ def _key_of(path: str, *, companion: bool) -> str:
     return f"{folder}/{name}/" if companion else f"{folder}/{name.rpartition('.')[0]}"
 
 
-def unknown_labels(given: GestureSet, labels: Iterable[str]) -> str:
-    """Return a warning about labels that a gesture set, which was not inferred, has not; "" if it has all."""
-    counts = Counter(label for label in labels if given.find(label) is None)
-    if given.inferred or not counts:
-        return ""
-    listed = ", ".join(f"'{label}' ({n})" for label, n in counts.most_common(8)) + (", …" if len(counts) > 8 else "")
-    return Message(
-        "the gesture set '{set}' has no gesture {labels}: such recordings become gestures without affect; give other "
-        "spellings as aliases of a pattern, or a gesture set that has them",
-        set=given.name,
-        labels=listed,
-    )
+def label_notes(given: GestureSet | None, labels: Iterable[str]) -> Iterator[Message]:
+    """Yield warnings about labels that look like one gesture, and that a set, which was not inferred, has not."""
+    counts = Counter(labels)
+    known = () if given is None or given.inferred else given.labels
+    lacks = [label for label in counts if given is not None and known and given.find(label) is None]
+    for group in alike_labels((*known, *counts)):
+        if known and not set(group) & set(lacks):
+            continue
+        # A label of the set comes first: the others are spellings of it.
+        first, *others = sorted(group, key=lambda label: (label not in known, -counts[label]))
+        yield Message(
+            "{labels} look like spellings of one gesture, but become {n}: if they are one, rename the files, or give "
+            "--gestures a set in which the gesture '{first}' has  labels = {others}",
+            labels=", ".join(f"'{label}' ({counts[label]})" for label in group),
+            n=len(group),
+            first=first,
+            others=json.dumps(others, ensure_ascii=False),
+        )
+    if lacks and given is not None:
+        listed = ", ".join(f"'{label}' ({counts[label]})" for label in sorted(lacks, key=lambda k: -counts[k])[:8])
+        yield Message(
+            "the gesture set '{set}' has no gesture {labels}: such recordings become gestures without affect; give "
+            "other spellings as aliases of a pattern, or a gesture set that has them",
+            set=given.name,
+            labels=listed + (", …" if len(lacks) > 8 else ""),
+        )
 
 
 def _extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
@@ -447,8 +462,7 @@ def create_dataset(
         infos = apply_marks(built.dataset.recordings, read_marks(work), gestures)
         write_index_files(Dataset(work, head, infos, built.dataset.streams))
         files.check()
-    if scan.gestures is not None and (note := unknown_labels(scan.gestures, (r.gesture for r in infos))):
-        notes.append(note)
+    notes += label_notes(scan.gestures, (r.gesture for r in infos))
     dataset = Dataset(dest, head, infos, built.dataset.streams)
     return files.result(dataset, virtual + scan.notes + notes + remarks, len(trims))
 
@@ -558,8 +572,7 @@ def add_to_dataset(
         rebuilt = rebuild_index(dest, head).dataset if files.kept or marks else open_dataset(dest)
     come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
     notes += remarks + _returning_people_warning(dest, come)
-    if note := unknown_labels(own, (r.gesture for r in built.dataset.recordings)):
-        notes.append(note)
+    notes += label_notes(own, (r.gesture for r in built.dataset.recordings))
     return files.result(rebuilt, scan.notes + notes, len(trims))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.gestures import plain_label
+from plushsense.core.gestures import alike_labels, plain_label
 from plushsense.core.sentences import Message, join_names
 from plushsense.dataset.importing.columns import (
     CODE_NAMES,
@@ -476,16 +476,14 @@ def doubt_idle(guess: PatternDraft) -> None:
 
 def guess_aliases(guess: PatternDraft) -> None:
     """Find spellings of one label that differ in more than case, spaces and underlines."""
-    groups: dict[str, Counter[str]] = {}
-    for label, count in guess.labels.items():
-        groups.setdefault(re.sub(r"[\W_]+", "", label.casefold()), Counter())[label] = count
     aliases = {}
-    for spellings in groups.values():
-        if len({plain_label(s) for s in spellings}) > 1:
-            # The spelling with separate words reads best.
-            best = max(spellings, key=lambda s: (len(s), spellings[s]))
-            aliases[best] = sorted(s for s in spellings if s != best)
-            listed = ", ".join(repr(s) for s in sorted(spellings))
-            guess.doubt("{listed} are taken for one label", "label", listed=listed)
+    for alike in alike_labels(guess.labels):
+        plain = {plain_label(label) for label in alike}
+        spellings = sorted(label for label in guess.labels if plain_label(label) in plain)
+        # The spelling with separate words reads best.
+        best = max(spellings, key=lambda s: (len(s), guess.labels[s]))
+        aliases[best] = [s for s in spellings if s != best]
+        listed = join_names(repr(s) for s in spellings)
+        guess.doubt("{listed} are taken for one label", "label", listed=listed)
     if aliases:
         guess.keys["aliases"] = aliases

@@ -21,7 +21,7 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames, parse_name, read_recording, read_stream
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.archives import UnpackLimits
-from plushsense.dataset.importing.build import add_to_dataset, create_dataset, unknown_labels
+from plushsense.dataset.importing.build import add_to_dataset, create_dataset, label_notes
 from plushsense.dataset.importing.counters import counters_note
 from plushsense.dataset.importing.pattern import ImportPattern, read_pattern
 from plushsense.dataset.importing.proposals import SELF_CALIBRATION, Proposal, adopt, find_sensors, propose_settings
@@ -178,8 +178,7 @@ def _preview(scan: SourceScan) -> ImportPreview:
         rows += _preview_rows(file, named.get(file.source, ""), first, scan.layout)
         flags += [(file.origin, issue.message) for issue in clock_still(Examination(read.frames, scan.layout))]
     notes = [*scan.notes, *counters_note(scan.layout, frames), *group_flags(flags)]
-    if scan.gestures is not None and (note := unknown_labels(scan.gestures, named.values())):
-        notes.append(note)
+    notes += label_notes(scan.gestures, named.values())
     return ImportPreview(
         scan.layout.name,
         len(recordings),

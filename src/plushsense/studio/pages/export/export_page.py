@@ -170,6 +170,14 @@ def _list_facts(words: Words, export: ExportFacts, model: ModelFacts) -> None:
             (words("Network structure"), model.title),
             (words("Gestures"), str(model.classes)),
             (words("Sensors"), model.layout),
+            *(
+                (
+                    words("Accelerometer at rest"),
+                    words("about {value} {unit}", value=words.count(rest.value), unit=rest.unit),
+                )
+                for rest in model.rest
+                if rest.steps
+            ),
             (
                 words("Flash for the network"),
                 words("{n:,} bytes, without the code; see the cost below", n=model.flash_bytes),
