@@ -65,7 +65,7 @@ def sanitized(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list
 def _sanitize(c_compiler: str, folder: Path) -> None:
     # Where sums and differences wrap on purpose: modulo 2^32 they come out right. Anywhere else it is a fault.
     wrapping = (
-        *("square", "surplus", "four_sums", "advance", "dense", "interpolate"),
+        *("square", "surplus", "alone", "pair", "activations", "dense", "interpolate"),
         *("bits_of", "distance_of", "from_zero", "convolve", "invariants"),
     )
     (folder / "wrapping").write_text("".join(f"fun:{name}\n" for name in wrapping))

@@ -19,16 +19,18 @@ from hypothesis import strategies as st
 TESTS = Path(__file__).parents[1]
 
 from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, answers_of, column
+from plushsense.models.arch import ConvLayer
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import BEGUN, NO_GESTURE, EventSettings
-from plushsense.runtime.fixed import exponentials
+from plushsense.runtime.fixed import InputScale, Requantize, exponentials, split_ratio
 from plushsense.runtime.gate import DOUBT, JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel, memory_bytes
+from plushsense.runtime.integer import MOST_REACH
 from plushsense.runtime.machine import Sample, ToyMachine
 from plushsense.windows.clock import burst_ms
 from support.c_toy import answers, seat
-from support.integers import INT32, any_frames, edged_model, models, plain_model, ruled_model
+from support.integers import INT32, any_frames, any_network, edged_model, models, plain_model, ruled_model
 
 OK, TOO_SMALL, NOT_ALIGNED, MEMORY_NOT_ALIGNED = 0, 4, 7, 8
 
@@ -95,6 +97,27 @@ def test_every_edge(c_library: Any, plain_c_library: Any) -> None:
         assert (logits.min(), logits.max()) == (-16384, 16384)
         assert np.array_equal(logits[:, 0], logits[:, 1])
         assert 1 not in best
+
+
+def test_sums_at_the_ends_of_their_24_bits(c_library: Any, plain_c_library: Any) -> None:
+    """Inputs are 0 or 255, and the weights of each filter add up to as much as is allowed."""
+    plain = plain_model()
+    arch = replace(plain.network.arch, layers=(ConvLayer(130, 1, 6), ConvLayer(4, 3, 5)))
+    network = any_network(arch, plain.layout, np.random.default_rng(1))
+    first, n = network.layers[0], np.arange(260)
+    rows = [n * 0 + 127, n * 0 - 128, (-1) ** n * 127, n * 0 - 127, np.where(n < 130, 127, -128), n * 0 - 128]
+    weights = np.array([row * (np.abs(row).cumsum() <= MOST_REACH) for row in rows], dtype=np.int8).reshape(6, 2, 130)
+    assert MOST_REACH - np.abs(weights.astype(int)).sum(axis=(1, 2)).max() == 0
+    inputs = InputScale(*np.array([[0, 0, 32767, 0, 0]] * 2).T)
+    scale = Requantize(*np.array([split_ratio(1 / MOST_REACH, 255 * MOST_REACH)] * 6).T)
+    first = replace(first, weights=weights, scale=scale)
+    model = replace(plain, network=replace(network, inputs=inputs, layers=(first, network.layers[1])))
+    touched = np.repeat(np.random.default_rng(1).integers(0, 2, (30, 4)), np.arange(1, 31) * 2, axis=0) * 2000 - 1000
+    frames = np.column_stack([10 * np.arange(len(touched)), touched])
+    expected = answers_of(model, frames)
+    assert len(np.unique(answers(expected)[:, 9:12])) > 50
+    for library in (c_library, plain_c_library):
+        assert np.array_equal(seat(library, model).push(frames), expected)
 
 
 @settings(max_examples=30)

@@ -15,6 +15,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
 from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.integer import MOST_REACH
 from plushsense.windows.features import Scaler
 
 GESTURES = GestureSet("three", (Gesture("tap", "positive"), Gesture("hold", "neutral"), Gesture("hit", "negative")))
@@ -73,6 +74,17 @@ def test_long_kernels_answer_nearly_as_in_floats() -> None:
         errors.append(np.sqrt(np.square(found - expected).mean()) / expected.std(axis=0).mean())
     # 1.2 % now; 2.6 % if the rounding errors are not carried to the next tap, 2.7 % if the ranges leave no room.
     assert np.mean(errors) < 0.018, errors
+
+
+def test_many_large_weights_get_a_coarser_scale() -> None:
+    """The sums of a filter stay within 24 bits, as the toy needs it."""
+    arch = Arch.parse("130d1", (2,), channels=3, classes=3, window=200, step=5)
+    even = random_weights(arch, 1)
+    even["conv0.weight"] = np.sign(even["conv0.weight"])
+    learnt = windows(0, 10, arch.span)
+    bundle = Bundle(arch, even, load_layout("accel-3"), Scaler.fit(learnt), GESTURES)
+    sums = np.abs(integer_network(calibrated(bundle, learnt)).layers[0].weights.astype(int)).sum(axis=(1, 2))
+    assert 0.97 * MOST_REACH < sums.min() <= sums.max() <= MOST_REACH
 
 
 def test_the_smoothing_is_the_bundles_by_default() -> None:

@@ -57,7 +57,7 @@ def test_read_back(model: IntegerModel) -> None:
     image = model.to_bytes()
     network, layout, arch = model.network, model.layout, model.network.arch
     magic, version, zero, length, crc = struct.unpack_from("<4sHHII", image)
-    assert (magic, version, zero, length) == (b"PLSH", 6, 0, len(image))
+    assert (magic, version, zero, length) == (b"PLSH", 10, 0, len(image))
     assert crc == zlib.crc32(image[16:])
     r = Reader(image[16:])
     head = r.take("BBBBHHIIIIHH")
@@ -98,10 +98,11 @@ def test_read_back(model: IntegerModel) -> None:
         for group in range(0, layer.filters, 4):
             for tap in range(layer.kernel):
                 for channel in range(0, read, 4):
-                    for f in range(group, group + 4):
-                        for c in range(channel, channel + 4):
-                            inside = f < layer.filters and c < read
-                            assert r.take("B")[0] - 128 == (part.weights[f, c, tap] if inside else 0)
+                    for c in (channel, channel + 2, channel + 1, channel + 3):
+                        codes = r.take("BBBb")
+                        for f, zero in enumerate((128, 128, 128, 0)):
+                            inside = group + f < layer.filters and c < read
+                            assert codes[f] - zero == (part.weights[group + f, c, tap] if inside else 0)
     for k in range(arch.classes):
         s = network.dense.scale
         assert r.take("iHBB") == tuple(int(c[k]) for c in (network.dense.bias, s.multiplier, s.before, s.after))
@@ -135,7 +136,8 @@ def test_read_back(model: IntegerModel) -> None:
 
 def test_weights_of_every_size_fit_a_byte() -> None:
     weights = np.arange(-128, 128, dtype=np.int8).reshape(4, 4, 16)
-    assert sorted(grouped_weights(weights).ravel().tolist()) == list(range(256))
+    codes = grouped_weights(weights) ^ np.array([128, 128, 128, 0], dtype=np.uint8)
+    assert sorted(codes.view(np.int8).ravel().tolist()) == list(range(-128, 128))
 
 
 PULL = Rule((Term(0, 16),), 3, NO_GESTURE)

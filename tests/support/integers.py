@@ -18,7 +18,15 @@ from plushsense.runtime.fixed import InputScale, LogitScale, Requantize, split_r
 from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.integer import MOST_DOWN, IntegerDense, IntegerLayer, IntegerNetwork, IntegerVectors, down_for
+from plushsense.runtime.integer import (
+    MOST_DOWN,
+    MOST_REACH,
+    IntegerDense,
+    IntegerLayer,
+    IntegerNetwork,
+    IntegerVectors,
+    down_for,
+)
 
 Ints = NDArray[np.int64]
 INT32 = -(1 << 31), (1 << 31) - 1
@@ -97,6 +105,11 @@ def any_network(arch: Arch, layout: Layout, rng: np.random.Generator) -> Integer
             return rng.choice(np.array([-128, 127], dtype=np.int8), shape)
         return rng.integers(-128, 128, shape).astype(np.int8)
 
+    def fitting(whole: NDArray[np.int8]) -> NDArray[np.int8]:
+        """Weights whose sums fit, some of them just so."""
+        inside = np.cumsum(np.abs(whole.astype(np.int64)).reshape(len(whole), -1), axis=1) <= MOST_REACH
+        return whole * inside.reshape(whole.shape).astype(np.int8)
+
     def bias(typical: float, n: int) -> Ints:
         return np.asarray(rng.normal(size=n) * typical).astype(np.int64)
 
@@ -122,7 +135,7 @@ def any_network(arch: Arch, layout: Layout, rng: np.random.Generator) -> Integer
     for read, layer in zip(arch.inputs, arch.layers, strict=True):
         typical = 74 * 60 * np.sqrt(layer.kernel * read)
         ratios = 255 / (3 * typical) * np.exp(rng.normal(size=layer.filters) / 2)
-        whole = weights(layer.filters, read, layer.kernel)
+        whole = fitting(weights(layer.filters, read, layer.kernel))
         layers.append(IntegerLayer(whole, bias(typical, layer.filters), Requantize(*scales(ratios, 255))))
     typical = 74 * 60 * np.sqrt(arch.features) * arch.pooled
     ratios = 1500 / typical * np.exp(rng.normal(size=arch.classes) / 2)

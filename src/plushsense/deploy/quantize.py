@@ -38,6 +38,7 @@ from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.integer import (
     AXIS_LIMIT,
     MOST_AXIS_SHIFT,
+    MOST_REACH,
     IntegerDense,
     IntegerLayer,
     IntegerNetwork,
@@ -229,12 +230,15 @@ def _codes(mean: Floats, start: Floats, unit: Floats) -> Floats:
 
 
 def _eight_bits(w: Floats, b: Floats, mean_input: Floats) -> tuple[NDArray[np.int8], NDArray[np.int64], Floats]:
-    """Quantize weights (F, C, K) or (F, C) and biases (F,) per filter: the largest weight becomes ±127.
+    """Quantize weights (F, C, K) or (F, C) and biases (F,) per filter: the largest weight becomes ±127, or less if all
+    of a convolution would exceed `MOST_REACH`.
 
     ``mean_input`` (C,) is the mean input; the bias compensates the mean error of the rounded weights.
     """
-    rows = np.abs(w).reshape(len(w), -1).max(axis=1)
-    scale = np.maximum(np.maximum(rows / 127, np.abs(b) / (1 << 29)), 1e-30)
+    rows = np.abs(w).reshape(len(w), -1)
+    scale = np.maximum(np.maximum(rows.max(axis=1) / 127, np.abs(b) / (1 << 29)), 1e-30)
+    if w.ndim > 2:  # rounding adds at most 1 to each
+        scale = np.maximum(scale, rows.sum(axis=1) / max(MOST_REACH - rows.shape[1], 1))
     scales = scale.reshape(-1, *[1] * (w.ndim - 1))
     whole = rounded_weights(w / scales)
     mean_error = (w - whole * scales).reshape(*w.shape[:2], -1).sum(axis=2) @ mean_input

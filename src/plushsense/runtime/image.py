@@ -15,8 +15,9 @@ of everything after the head. The following sections come in this order:
 - 0 to 3 bytes 0, up to a multiple of 4 bytes from the beginning: scales and weights of all layers are then aligned
 - for each input, or with a vector layer each of its outputs: i32 offset, i32 bias, u16 multiplier, u8 before, u8 after
 - for each layer: u16 kernel, u16 dilation, u16 input channels, u16 filters; for each filter: i32 bias, u16 multiplier,
-  u8 before, u8 after; then the weights + 128 as u8, in blocks of 4 filters × 4 channels, ordered by group of 4 filters,
-  tap, and group of 4 channels (both padded to a multiple of 4)
+  u8 before, u8 after; then the weights, in blocks of 4 channels × 4 filters, ordered by group of 4 filters, tap, and
+  group of 4 channels (both padded to a multiple of 4); in a block for the first, third, second and last channel: 3 × u8
+  weight + 128, i8 weight of the last filter
 - for each class: i32 bias, u16 multiplier, u8 before, u8 after; then classes × features weights + 128 as u8
 - for each class: u8 affect (0 none, 1 positive, 2 neutral, 3 negative), plus 4 if the class is idle
 - for each class: its label in UTF-8 and a 0; then the title of the model in UTF-8 and a 0
@@ -62,14 +63,17 @@ from plushsense.runtime.integer import MOST_AXIS_SHIFT, IntegerNetwork, IntegerV
 MAGIC = b"PLSH"
 PATCH_MAGIC = b"PLPT"
 # 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score; 6: aligned weights
-IMAGE_VERSION = 6
-CALIBRATED_IMAGE_VERSION = 8  # of a model with a self-calibration
+# 10: four filters in a word
+IMAGE_VERSION = 10
+CALIBRATED_IMAGE_VERSION = 11  # of a model with a self-calibration
 _WINDOW_VERSIONS = (7, 9)  # once of networks that computed a window again at every step
 _OTHER_SENSOR = 128  # added to the shift of a sensor that is no accelerometer
 SENSOR_BYTES = 200  # of the state of a sensor that calibrates itself
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
+_CHANNELS = [0, 2, 1, 3]  # their order in a block
+_CODES = np.array([128, 128, 128, 0], dtype=np.uint8)  # what is added to the weights of its filters
 SPARE = 4  # rows for new samples in each phase of a streaming layer
 MOST_TAPS = 255  # of a vector layer
 MOST_ROWS = (1 << 16) - 1 - SPARE  # samples that a layer remembers
@@ -403,9 +407,9 @@ def _scales(bias: NDArray[np.int64], scale: Requantize | LogitScale) -> bytes:
 
 
 def grouped_weights(weights: NDArray[np.int8]) -> NDArray[np.uint8]:
-    """Return weights (F, C, K) + 128 in the order of the image, (⌈F/4⌉, K, ⌈C/4⌉, 4, 4); the padding is 128."""
+    """Return weights (F, C, K) in the order and codes of the image, (⌈F/4⌉, K, ⌈C/4⌉, 4, 4); the padding is 0."""
     f, c, k = weights.shape
-    full = np.zeros((_filled(f), _filled(c), k), dtype=np.int16)
+    full = np.zeros((_filled(f), _filled(c), k), dtype=np.int8)
     full[:f, :c] = weights
-    split = full.reshape(len(full) // GROUP, GROUP, full.shape[1] // GROUP, GROUP, k)
-    return np.ascontiguousarray(split.transpose(0, 4, 2, 1, 3) + 128).astype(np.uint8)
+    split = full.reshape(len(full) // GROUP, GROUP, full.shape[1] // GROUP, GROUP, k).transpose(0, 4, 2, 3, 1)
+    return np.ascontiguousarray(split[..., _CHANNELS, :]).view(np.uint8) ^ _CODES

@@ -125,6 +125,8 @@ def _invariants(d: Ints, up: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 _SUM_LIMIT = (1 << 31) - 1
+MOST_REACH = ((1 << 23) - 1) // 255
+"""Most that the absolute weights of a filter may add up to, since the toy keeps its sums in 24 bits (without bias)."""
 
 
 def deployable(arch: Arch) -> bool:
@@ -192,7 +194,7 @@ class IntegerNetwork:
     """A network in integers.
 
     Raises:
-        BundleError: if the layers do not fit ``arch``, or a sum could exceed 32 bits.
+        BundleError: if the layers do not fit ``arch``, or a sum could exceed 32 bits, or 24 in a convolution.
     """
 
     arch: Arch
@@ -229,7 +231,10 @@ class IntegerNetwork:
                     f"{part.bias.dtype}: accepted are int8 and whole numbers."
                 )
             most = 255 * (arch.pooled if part is self.dense else 1)
-            reach = np.abs(part.weights.astype(np.int64)).reshape(len(part.bias), -1).sum(axis=1) * most
+            reach = np.abs(part.weights.astype(np.int64)).reshape(len(part.bias), -1).sum(axis=1)
+            if part is not self.dense and reach.max() > MOST_REACH:
+                raise BundleError(f"A sum of layer {n} of {arch.title} could leave 24 bits: use fewer taps or filters.")
+            reach *= most
             # In floats, since biases of 64 bits may overflow.
             if part.weights.size and (np.abs(part.bias.astype(np.float64)) + reach).max() > _SUM_LIMIT:
                 raise BundleError(f"A sum of layer {n} of {arch.title} could leave 32 bits: use fewer taps or filters.")

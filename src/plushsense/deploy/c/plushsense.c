@@ -134,6 +134,19 @@ static uint32_t le32(const uint8_t *p)
     return le16(p) | (le16(p + 2) << 16);
 }
 
+/* The same at a multiple of 4. */
+#if defined(__GNUC__) && defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
+static uint32_t aligned_le32(const uint8_t *p)
+{
+    uint32_t v;
+
+    __builtin_memcpy(&v, __builtin_assume_aligned(p, GROUP), sizeof v);
+    return v;
+}
+#else
+#define aligned_le32 le32
+#endif
+
 /* The number with these bits in two's complement. */
 static int32_t as_signed(uint32_t bits)
 {
@@ -725,167 +738,243 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 
 /* ---- What differs from core to core ----------------------------------------------------------------------------- */
 
-/* Three ways to the same numbers: instructions for several bytes at once where a core has them, otherwise plain C.
- * PLUSH_PLAIN asks for plain C everywhere.
+/* The weights of four filters for one channel are the bytes of a word: 128 is added to the first three. Three products of
+ * 32 bits stand for four of 8 bits, as no sum of a convolution has more than 24. Modulo 2^32, the sums over all channels
  *
- *     PLUSH_ALONE            the next 4 activations at `x`, times the weights (with 128 added) of 4 filters at `w`
- *     PLUSH_PAIR             the same of 2 filters, at `x` and at `y`: a weight is loaded once for two positions. Not
- *                            where it takes longer.
+ *     of the activation * the word                   are  a = s0 + 2^8 s1 + 2^16 s2 + 2^24 s3
+ *     of the activation * its high half, signed      are  b = s2 + 2^8 s3
+ *     of the activation * the two bytes between      are  c = s1 + 2^8 s2
+ *
+ * and the low 24 bits of a - 2^8 c are s0, from which the others follow: see activations(). Other instructions may have other
+ * sums.
+ *
+ *     PLUSH_ALONE            the next 4 activations at `x`, times the weights of 4 filters at `w`: words of the channels
+ *                            0, 2, 1 and 3
+ *     PLUSH_PAIR             the same at `x` and at `y`: a weight is loaded once for two positions
+ *     PLUSH_SUMS(s)          what is summed up at `x`, and `t` at `y`; PLUSH_GIVE puts it into `sum`
  *     PLUSH_SUM_BYTES(s, v)  the four bytes of a word, into `s`
  *     PLUSH_LIMIT(v, bits)   a number below 2^31, at most the highest of so many bits
- */
+ *
+ * PLUSH_PLAIN asks for plain C everywhere. */
 #if defined(__GNUC__) && defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && !defined(PLUSH_PLAIN)
 
 #define PLUSH_DSP
 #define PLUSH_SUM_BYTES(s, v) __asm__("usada8 %0, %1, %2, %0" : "+r"(s) : "r"(v), "r"(0))
 #define PLUSH_LIMIT(v, bits) __asm__("usat %0, %1, %0" : "+r"(v) : "i"(bits))
 
-/* Two halves in a register: activations of channels 0 and 2 in `a`, 1 and 3 in `b`; weights of one filter in `c` and `d`,
- * of the next in `e` and `f`. */
-#define PLUSH_SPLIT(even, odd) "uxtb16 " odd ", " even ", ror #8\n\tuxtb16 " even ", " even "\n\t"
-#define PLUSH_ACTIVATIONS "ldr %[a], [%[x]], #4\n\t" PLUSH_SPLIT("%[a]", "%[b]")
-#define PLUSH_WEIGHTS(step) \
-    "ldrd %[c], %[e], [%[w]], #" step "\n\t" PLUSH_SPLIT("%[c]", "%[d]") PLUSH_SPLIT("%[e]", "%[f]")
-#define PLUSH_PRODUCTS                                                   \
-    "smlad %[s], %[a], %[c], %[s]\n\tsmlad %[t], %[a], %[e], %[t]\n\t"   \
-    "smlad %[s], %[b], %[d], %[s]\n\tsmlad %[t], %[b], %[f], %[t]"
-#define PLUSH_TWO_FILTERS(first, second)                                                                   \
-    __asm__ volatile(PLUSH_WEIGHTS("8") PLUSH_PRODUCTS                                                     \
-                     : [w] "+&r"(w), [s] "+&r"(first), [t] "+&r"(second), [c] "=&r"(c), [d] "=&r"(d),        \
-                       [e] "=&r"(e), [f] "=&r"(f)                                                          \
-                     : [a] "r"(a), [b] "r"(b)                                                              \
+/* Two halves in a register, of two channels: weights of filters 0 and 1 in `a`, of 2 and 3 in `b`, of 1 and 2 in `c`. A
+ * half is signed: its highest bit is turned where 128 was added. */
+#define PLUSH_WEIGHTS                                                                                      \
+    __asm__ volatile("ldrd %[c], %[d], [%[w]], #8\n\t"                                                     \
+                     "pkhbt %[a], %[c], %[d], lsl #16\n\teor %[a], %[a], #0x80008000\n\t"                  \
+                     "pkhtb %[b], %[d], %[c], asr #16\n\t"                                                 \
+                     "lsr %[c], %[c], #8\n\tpkhbt %[c], %[c], %[d], lsl #8\n\teor %[c], %[c], #0x80008000" \
+                     : [w] "+&r"(w), [a] "=&r"(a), [b] "=&r"(b), [c] "=&r"(c), [d] "=&r"(d)                \
+                     :                                                                                     \
                      : "memory")
-#define PLUSH_ALONE                                                                                        \
-    do {                                                                                                   \
-        uint32_t a, b, c, d, e, f;                                                                         \
-        __asm__ volatile(PLUSH_ACTIVATIONS : [x] "+&r"(x), [a] "=&r"(a), [b] "=&r"(b) : : "memory");       \
-        PLUSH_TWO_FILTERS(s0, s1);                                                                         \
-        PLUSH_TWO_FILTERS(s2, s3);                                                                         \
+#define PLUSH_PRODUCTS(x, next, turn, s, t, u)                                                             \
+    __asm__ volatile("ldr %[d], [%[p]]" next "\n\tuxtb16 %[d], %[d]" turn "\n\t"                           \
+                     "smlad %[i], %[d], %[a], %[i]\n\tsmlad %[j], %[d], %[b], %[j]\n\t"                    \
+                     "smlad %[k], %[d], %[c], %[k]"                                                        \
+                     : [p] "+&r"(x), [i] "+&r"(s), [j] "+&r"(t), [k] "+&r"(u), [d] "=&r"(d)                \
+                     : [a] "r"(a), [b] "r"(b), [c] "r"(c)                                                  \
+                     : "memory")
+#define PLUSH_ALONE                                                \
+    do {                                                           \
+        uint32_t a, b, c, d;                                       \
+        PLUSH_WEIGHTS;                                             \
+        PLUSH_PRODUCTS(x, "", "", s0, s1, s2);                     \
+        PLUSH_WEIGHTS;                                             \
+        PLUSH_PRODUCTS(x, ", #4", ", ror #8", s0, s1, s2);         \
     } while (0)
-#define PLUSH_PAIR                                                                                         \
-    do {                                                                                                   \
-        uint32_t a, b, c, d, e, f;                                                                         \
-        __asm__ volatile(PLUSH_WEIGHTS("16") PLUSH_ACTIVATIONS PLUSH_PRODUCTS                              \
-                         : [x] "+&r"(x), [w] "+&r"(w), [s] "+&r"(s0), [t] "+&r"(s1), [a] "=&r"(a),         \
-                           [b] "=&r"(b), [c] "=&r"(c), [d] "=&r"(d), [e] "=&r"(e), [f] "=&r"(f)            \
-                         :                                                                                 \
-                         : "memory");                                                                      \
-        __asm__ volatile(PLUSH_ACTIVATIONS PLUSH_PRODUCTS                                                  \
-                         : [x] "+&r"(y), [s] "+&r"(t0), [t] "+&r"(t1), [a] "=&r"(a), [b] "=&r"(b)          \
-                         : [c] "r"(c), [d] "r"(d), [e] "r"(e), [f] "r"(f)                                  \
-                         : "memory");                                                                      \
+#define PLUSH_PAIR                                                 \
+    do {                                                           \
+        uint32_t a, b, c, d;                                       \
+        PLUSH_WEIGHTS;                                             \
+        PLUSH_PRODUCTS(x, "", "", s0, s1, s2);                     \
+        PLUSH_PRODUCTS(y, "", "", t0, t1, t2);                     \
+        PLUSH_WEIGHTS;                                             \
+        PLUSH_PRODUCTS(x, ", #4", ", ror #8", s0, s1, s2);         \
+        PLUSH_PRODUCTS(y, ", #4", ", ror #8", t0, t1, t2);         \
     } while (0)
 
 #elif defined(__SSE2__) && !defined(PLUSH_PLAIN)
 
 #include <emmintrin.h>
 
-/* Every product of 8 x 8 bits fits 16; each sum is kept as two halves, of channels 0 and 1 and of 2 and 3. */
-#define PLUSH_SUMS __m128i zero = _mm_setzero_si128(), s01 = zero, s23 = zero
-#define PLUSH_ALONE                                                                      \
-    do {                                                                                 \
-        int32_t four;                                                                    \
-        __m128i a, b = _mm_loadu_si128((const __m128i *)(const void *)w);                \
-        memcpy(&four, x, 4);                                                             \
-        a = _mm_unpacklo_epi8(_mm_shuffle_epi32(_mm_cvtsi32_si128(four), 0), zero);      \
-        s01 = _mm_add_epi32(s01, _mm_madd_epi16(a, _mm_unpacklo_epi8(b, zero)));         \
-        s23 = _mm_add_epi32(s23, _mm_madd_epi16(a, _mm_unpackhi_epi8(b, zero)));         \
-        x += 4;                                                                          \
-        w += 16;                                                                         \
+/* Products of 16 bits, of two channels of a filter side by side; each sum by itself. */
+#define PLUSH_EACH
+#define PLUSH_SUMS(s) __m128i s = _mm_setzero_si128()
+#define PLUSH_GIVE(s, sum) memcpy(sum, &(s), sizeof(s))
+#define PLUSH_WEIGHTS                                                                                         \
+    __m128i v = _mm_loadu_si128((const __m128i *)(const void *)w), zero = _mm_setzero_si128(), b, c;          \
+    v = _mm_xor_si128(v, _mm_set1_epi32(INT32_MIN)); /* 128 is added to the last filter's, too */             \
+    v = _mm_unpacklo_epi8(v, _mm_unpackhi_epi64(v, v));                                                       \
+    b = _mm_unpacklo_epi8(v, zero);                                                                           \
+    c = _mm_unpackhi_epi8(v, zero);                                                                           \
+    w += 16
+#define PLUSH_PRODUCTS(x, s)                                                            \
+    do {                                                                                \
+        int32_t four;                                                                   \
+        __m128i a;                                                                      \
+        memcpy(&four, x, 4);                                                            \
+        a = _mm_unpacklo_epi8(_mm_cvtsi32_si128(four), zero);                           \
+        (s) = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x00), b));          \
+        (s) = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x55), c));          \
+        (x) += 4;                                                                       \
     } while (0)
-#define PLUSH_GIVE                                     \
-    do {                                               \
-        uint32_t halves[8], n;                         \
-        memcpy(halves, &s01, sizeof s01);              \
-        memcpy(halves + 4, &s23, sizeof s23);          \
-        for (n = 0; n < GROUP; n++)                    \
-            sum[n] = halves[2 * n] + halves[2 * n + 1]; \
+#define PLUSH_ALONE           \
+    do {                      \
+        PLUSH_WEIGHTS;        \
+        PLUSH_PRODUCTS(x, s); \
+    } while (0)
+#define PLUSH_PAIR            \
+    do {                      \
+        PLUSH_WEIGHTS;        \
+        PLUSH_PRODUCTS(x, s); \
+        PLUSH_PRODUCTS(y, t); \
     } while (0)
 
 #else
 
 /* Keeps a value in a register, and what is done to it in the written order: otherwise compilers add products up in trees,
  * for which small cores have too few registers. (clang gives no number of 32 bits to a register of AVR.) */
-#if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__)
+#if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__) && defined(__OPTIMIZE__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
+/* Eight registers multiply, and the others can be added to. */
+#define PLUSH_ADD(s, v) __asm__ volatile("add %0, %1" : "+h"(s) : "l"(v))
+#define PLUSH_NEXT_WORD(v) __asm__ volatile("ldmia %0!, {%1}" : "+l"(w), "=l"(v) : : "memory")
 #elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__) && !(defined(__AVR__) && defined(__clang__))
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
 #else
 #define PLUSH_KEEP(v) ((void)0)
 #endif
+#ifndef PLUSH_ADD
 #define PLUSH_ADD(s, v) \
     do {                \
         (s) += (v);     \
         PLUSH_KEEP(s);  \
     } while (0)
-/* A product of two bytes fits an int without sign, also of 16 bits. */
-#define PLUSH_CHANNEL(i)                \
-    do {                                \
-        unsigned a = x[i];              \
-        PLUSH_ADD(s0, a * w[i]);        \
-        PLUSH_ADD(s1, a * w[4 + (i)]);  \
-        PLUSH_ADD(s2, a * w[8 + (i)]);  \
-        PLUSH_ADD(s3, a * w[12 + (i)]); \
+#define PLUSH_NEXT_WORD(v) ((v) = aligned_le32(w), w += 4)
+#endif
+#ifdef __AVR__
+/* A product of two bytes fits an int without sign of 16 bits, which is quicker than fewer products of 32. */
+#define PLUSH_EACH
+#define PLUSH_SUMS(s) uint32_t s##0 = 0, s##1 = 0, s##2 = 0, s##3 = 0
+#define PLUSH_GIVE(s, sum)   \
+    do {                     \
+        (sum)[0] = s##0;     \
+        (sum)[1] = s##1;     \
+        (sum)[2] = s##2;     \
+        (sum)[3] = s##3;     \
     } while (0)
+#define PLUSH_CHANNEL(i)                          \
+    do {                                          \
+        unsigned a = x[i];                        \
+        PLUSH_ADD(s0, a * w[0]);                  \
+        PLUSH_ADD(s1, a * w[1]);                  \
+        PLUSH_ADD(s2, a * w[2]);                  \
+        PLUSH_ADD(s3, a * (w[3] ^ WEIGHT_ZERO));  \
+        w += 4;                                   \
+    } while (0)
+#else
+#define PLUSH_HIGH(v) bits_of(shift_down(as_signed(v), 16))
+#define PLUSH_CHANNEL(i)            \
+    do {                            \
+        uint32_t v, a = x[i], p;    \
+        PLUSH_NEXT_WORD(v);         \
+        p = PLUSH_HIGH(v) * a;      \
+        PLUSH_ADD(s1, p);           \
+        p = (v >> 8 & 0xffffu) * a; \
+        PLUSH_ADD(s2, p);           \
+        a *= v;                     \
+        PLUSH_ADD(s0, a);           \
+    } while (0)
+#endif
 #define PLUSH_ALONE       \
     do {                  \
         PLUSH_CHANNEL(0); \
-        PLUSH_CHANNEL(1); \
         PLUSH_CHANNEL(2); \
+        PLUSH_CHANNEL(1); \
         PLUSH_CHANNEL(3); \
         x += 4;           \
-        w += 16;          \
     } while (0)
-#if (!defined(__thumb__) || defined(__thumb2__)) && !defined(__AVR__)
-/* Four loads, then two products, then two sums: in a pipeline, what was loaded or multiplied is there one or two cycles
- * later. */
-#define PLUSH_PRODUCTS(s, t, v)            \
-    do {                                   \
-        uint32_t p = (v) * a, q = (v) * b; \
-        PLUSH_KEEP(p);                     \
-        PLUSH_KEEP(q);                     \
-        PLUSH_ADD(s, p);                   \
-        PLUSH_ADD(t, q);                   \
+#ifndef __AVR__
+#if defined(__thumb__) && !defined(__thumb2__)
+/* A product takes the place of a factor: in this order, one more copy is enough. */
+#define PLUSH_CHANNEL_OF_PAIR(i)    \
+    do {                            \
+        uint32_t v, a = x[i], p, c; \
+        PLUSH_NEXT_WORD(v);         \
+        p = PLUSH_HIGH(v) * a;      \
+        PLUSH_ADD(s1, p);           \
+        c = v >> 8 & 0xffffu;       \
+        p = c * a;                  \
+        PLUSH_ADD(s2, p);           \
+        a *= v;                     \
+        PLUSH_ADD(s0, a);           \
+        PLUSH_KEEP(v);              \
+        a = y[i];                   \
+        p = PLUSH_HIGH(v) * a;      \
+        PLUSH_ADD(t1, p);           \
+        c *= a;                     \
+        PLUSH_ADD(t2, c);           \
+        a *= v;                     \
+        t0 += a;                    \
+        PLUSH_KEEP(t0);             \
     } while (0)
-#define PLUSH_CHANNEL_OF_PAIR(i)                              \
-    do {                                                      \
-        uint32_t a = x[i], b = y[i], c = w[i], d = w[4 + (i)]; \
-        PLUSH_KEEP(a);                                        \
-        PLUSH_KEEP(b);                                        \
-        PLUSH_KEEP(c);                                        \
-        PLUSH_KEEP(d);                                        \
-        PLUSH_PRODUCTS(s0, t0, c);                            \
-        PLUSH_PRODUCTS(s1, t1, d);                            \
+#else
+/* In this order, 14 registers are enough for the loop. */
+#define PLUSH_CHANNEL_OF_PAIR(i)       \
+    do {                               \
+        uint32_t v, a = x[i], b, p, q; \
+        PLUSH_NEXT_WORD(v);            \
+        q = PLUSH_HIGH(v);             \
+        p = q * a;                     \
+        PLUSH_ADD(s1, p);              \
+        b = y[i];                      \
+        PLUSH_KEEP(b);                 \
+        q *= b;                        \
+        PLUSH_ADD(t1, q);              \
+        p = v * a;                     \
+        PLUSH_ADD(s0, p);              \
+        p = v * b;                     \
+        PLUSH_ADD(t0, p);              \
+        v = v >> 8 & 0xffffu;          \
+        a *= v;                        \
+        PLUSH_ADD(s2, a);              \
+        b *= v;                        \
+        PLUSH_ADD(t2, b);              \
     } while (0)
+#endif
 #define PLUSH_PAIR                \
     do {                          \
         PLUSH_CHANNEL_OF_PAIR(0); \
-        PLUSH_CHANNEL_OF_PAIR(1); \
         PLUSH_CHANNEL_OF_PAIR(2); \
+        PLUSH_CHANNEL_OF_PAIR(1); \
         PLUSH_CHANNEL_OF_PAIR(3); \
         x += 4;                   \
         y += 4;                   \
-        w += 16;                  \
     } while (0)
+
 #endif
 
 #endif
 
 #ifndef PLUSH_SUMS
-#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0
-#define PLUSH_GIVE   \
-    do {             \
-        sum[0] = s0; \
-        sum[1] = s1; \
-        sum[2] = s2; \
-        sum[3] = s3; \
+#define PLUSH_SUMS(s) uint32_t s##0 = 0, s##1 = 0, s##2 = 0
+#define PLUSH_GIVE(s, sum)   \
+    do {                     \
+        (sum)[0] = s##0;     \
+        (sum)[1] = s##1;     \
+        (sum)[2] = s##2;     \
     } while (0)
 #endif
 #ifndef PLUSH_DSP
 #define PLUSH_SUM_BYTES(s, v)                                                      \
     do {                                                                           \
         uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
-        (s) += (two & 0xffffu) + (two >> 16);                                      \
+        (s) += two * 0x10001u >> 16;                                               \
     } while (0)
 #define PLUSH_LIMIT(v, bits)                     \
     do {                                         \
@@ -918,10 +1007,11 @@ static uint8_t *next_row(plush_layer *layer)
     }
     phase = layer->ring + layer->phase * phase_rows(layer) * width;
     if (layer->row == layer->kernel) {
-        uint32_t *to = phase, *from = phase + SPARE * width, words;
+        uint32_t *to = phase, *from = phase + SPARE * width, *end = from + layer->kernel * width;
 
-        for (words = layer->kernel * width; words > 0; words--)
+        do
             *to++ = *from++;
+        while (from != end);
     }
     layer->taps[0] = phase + (layer->row + 1u - layer->kernel) * width;
     if (layer->dilation == 1) /* then the row before may have moved, too */
@@ -929,96 +1019,91 @@ static uint8_t *next_row(plush_layer *layer)
     return (uint8_t *)newest_row(layer, layer->taps[0]);
 }
 
-/* The sum of all bytes of a row. */
-PLUSH_CODE
-static uint32_t row_sum(const plush_layer *layer, const uint32_t *row)
-{
-    uint32_t sum = 0, n;
-
-    for (n = layer->groups; n > 0; n--)
-        PLUSH_SUM_BYTES(sum, *row++);
-    return sum;
-}
-
 /* What every weight's + 128 adds to the sums of a position: 128 times all activations under the taps. Their sum is that
  * of `dilation` samples ago, less the row that has left, plus the one that has come. */
 PLUSH_CODE
 static uint32_t surplus(plush_layer *layer, uint32_t back)
 {
-    uint32_t phase = back <= layer->phase ? layer->phase - back : layer->dilation - 1u;
-    uint32_t sum = layer->tap_sums[phase] + row_sum(layer, newest_row(layer, layer->taps[back]));
+    uint32_t phase = back <= layer->phase ? layer->phase - back : layer->dilation - 1u, *sum = layer->tap_sums + phase;
+    const uint32_t *left = layer->taps[back], *come = newest_row(layer, layer->taps[back]);
+    uint32_t plus = *sum, minus = 0, n = layer->groups;
 
-    layer->tap_sums[phase] = sum - row_sum(layer, layer->taps[back]);
-    return sum * WEIGHT_ZERO;
+    do {
+        PLUSH_SUM_BYTES(plus, *come++);
+        PLUSH_SUM_BYTES(minus, *left++);
+    } while (--n > 0);
+    *sum = plus - minus;
+    return plus * WEIGHT_ZERO;
 }
 
-/* The sums of four filters at one position, of activations times (weight + 128), modulo 2^32. By itself, so that its loop
- * has all registers. */
+/* What is summed up of four filters at one position. By itself, so that its loop has all registers. */
 PLUSH_APART
-static void four_sums(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[GROUP])
+static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[GROUP])
 {
-    PLUSH_SUMS;
+    PLUSH_SUMS(s);
 
-#ifdef PLUSH_DSP /* elsewhere a second copy takes more bytes than it is worth */
-    if (((end - x) & 4) != 0)
-        PLUSH_ALONE;
-    while (x != end) {
-        PLUSH_ALONE;
-        PLUSH_ALONE;
-    }
-#endif
-#ifndef PLUSH_DSP
     do
         PLUSH_ALONE;
     while (x != end);
-#endif
-    PLUSH_GIVE;
+    PLUSH_GIVE(s, sum);
 }
 
-#ifdef PLUSH_PAIR
-/* The same of two filters at two positions: sum[0] and sum[1] at `x`, sum[4] and sum[5] at `y`. */
+/* The same at two positions, `x` first. */
 PLUSH_APART
-static void two_sums(const uint8_t *x, const uint8_t *y, const uint8_t *end, const uint8_t *w, uint32_t *sum)
-{
-    uint32_t s0 = 0, s1 = 0, t0 = 0, t1 = 0;
-
-    if (((end - x) & 4) != 0)
-        PLUSH_PAIR;
-    while (x != end) {
-        PLUSH_PAIR;
-        PLUSH_PAIR;
-    }
-    sum[0] = s0;
-    sum[1] = s1;
-    sum[GROUP] = t0;
-    sum[GROUP + 1] = t1;
-}
-#endif
-
-/* The sums of four filters at two positions: sum[0] to sum[3] those at `x`, then those at `y`. */
-PLUSH_CODE
-static void pair_sums(const uint8_t *x, const uint8_t *y, uint32_t size, const uint8_t *w, uint32_t sum[2 * GROUP])
+static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const uint8_t *w, uint32_t sum[2 * GROUP])
 {
 #ifdef PLUSH_PAIR
-    two_sums(x, y, x + size, w, sum);
-    two_sums(x, y, x + size, w + 2 * GROUP, sum + 2);
-#endif
-#ifndef PLUSH_PAIR
-    four_sums(x, x + size, w, sum);
-    four_sums(y, y + size, w, sum + GROUP);
+    PLUSH_SUMS(s);
+    PLUSH_SUMS(t);
+
+    do
+        PLUSH_PAIR;
+    while (x != end);
+    PLUSH_GIVE(s, sum);
+    PLUSH_GIVE(t, sum + GROUP);
+#else
+    alone(x, end, w, sum);
+    alone(y, y + (end - x), w, sum + GROUP);
 #endif
 }
 
-/* ReLU, and a sum to 8 bits. */
+/* ReLU, and a sum to 8 bits; rounded half up, also where `after` is 0. */
 PLUSH_CODE
 static uint32_t requantize(int32_t sum, uint32_t times, uint32_t before, uint32_t after)
 {
     uint32_t t = (uint32_t)(sum > 0 ? sum : 0) >> before;
 
     PLUSH_LIMIT(t, 16);
-    t = (t * times + half(after)) >> after;
+    t = ((2u * t * times >> after) + 1u) >> 1;
     PLUSH_LIMIT(t, 8);
     return t;
+}
+
+/* The activations at one position of four filters, or of the `n` that there are; `sum` is what was summed up of them, and
+ * `extra` what surplus() says. */
+PLUSH_APART
+static void activations(uint32_t sum[GROUP], uint32_t extra, const uint8_t *scale, uint32_t n, uint8_t *out)
+{
+#ifdef PLUSH_EACH
+    uint32_t i;
+
+    for (i = 0; i < GROUP; i++)
+        sum[i] -= extra;
+#else
+#ifdef PLUSH_DSP
+    uint32_t b = sum[1] - extra, c = sum[2] - extra, a = sum[0] - extra + (b << 16);
+#else
+    uint32_t b = sum[1] - extra, c = sum[2] - extra * 257u, a = sum[0] - extra * UINT32_C(0x10101);
+#endif
+
+    sum[0] = bits_of(shift_down(as_signed((a - (c << 8)) << 8), 8));
+    sum[1] = bits_of(shift_down(as_signed(a - (b << 16) - sum[0]), 8));
+    sum[2] = bits_of(shift_down(as_signed(c - sum[1]), 8));
+    sum[3] = bits_of(shift_down(as_signed(b - sum[2]), 8));
+#endif
+    for (; n > 0; n--, scale += SCALE_BYTES)
+        *out++ = (uint8_t)requantize(as_signed(*sum++ + aligned_le32(scale)), aligned_le32(scale + 4) & 0xffffu, scale[6],
+                                     scale[7]);
 }
 
 /* A new position of a layer, (filters) activations, or two: then `before` are those of the older one. */
@@ -1027,22 +1112,19 @@ static void advance(plush_layer *layer, int two, uint8_t *newest, uint8_t *befor
 {
     const uint8_t *x = (const uint8_t *)layer->taps[0], *y = (const uint8_t *)layer->taps[1];
     const uint8_t *weights = layer->weights, *scale = layer->scales;
-    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP, sum[2 * GROUP], f, i;
+    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP, sum[2 * GROUP], f;
     uint32_t extra_before = two ? surplus(layer, 1) : 0, extra = surplus(layer, 0);
 
-    for (f = 0; f < layer->filters; f += GROUP, weights += size * GROUP) {
-        if (two)
-            pair_sums(x, y, size, weights, sum);
-        else
-            four_sums(x, x + size, weights, sum);
-        for (i = 0; i < GROUP && f + i < layer->filters; i++, scale += SCALE_BYTES) {
-            uint32_t bias = le32(scale), times = le16(scale + 4), down = scale[6], after = scale[7];
+    for (f = 0; f < layer->filters; f += GROUP, weights += size * GROUP, scale += GROUP * SCALE_BYTES) {
+        uint32_t n = layer->filters - f < GROUP ? layer->filters - f : GROUP;
 
-            newest[f + i] = (uint8_t)requantize(as_signed(sum[i] + bias - extra), times, down, after);
-            if (two)
-                before[f + i] =
-                    (uint8_t)requantize(as_signed(sum[GROUP + i] + bias - extra_before), times, down, after);
+        if (two) {
+            pair(x, x + size, y, weights, sum);
+            activations(sum + GROUP, extra_before, scale, n, before + f);
+        } else {
+            alone(x, x + size, weights, sum);
         }
+        activations(sum, extra, scale, n, newest + f);
     }
 }
 

@@ -45,9 +45,9 @@ extern "C" {
 
 /* #undef PLUSH_CALIBRATE */
 #ifdef PLUSH_CALIBRATE /* a model whose sensors find their offset and scale themselves; see plush_calibrate.h */
-#define PLUSH_IMAGE_VERSION 8
+#define PLUSH_IMAGE_VERSION 11
 #else
-#define PLUSH_IMAGE_VERSION 6
+#define PLUSH_IMAGE_VERSION 10
 #endif
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
@@ -115,8 +115,9 @@ typedef enum {
 typedef enum { PLUSH_NETWORK = 0, PLUSH_GATE = 1 } plush_source;
 
 /* Their names, for your log: static const char *const states[] = PLUSH_STATE_NAMES; */
-#define PLUSH_STATUS_NAMES \
-    {"ok", "not a model", "other version", "damaged", "memory too small", "other layout", "other model", "not aligned"}
+#define PLUSH_STATUS_NAMES                                                                                               \
+    {"ok", "not a model", "other version", "damaged", "memory too small", "other layout", "other model", "not aligned", \
+     "memory not aligned"}
 #define PLUSH_STATE_NAMES {"warming", "tracking", "fault"}
 #define PLUSH_READING_NAMES {"none", "waiting", "fault", "first", "used", "left out"}
 #define PLUSH_KIND_NAMES {"idle", "unknown", "unsure", "sure affect", "sure gesture"}
