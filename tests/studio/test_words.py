@@ -14,7 +14,7 @@ import pytest
 from babel.messages.pofile import read_po
 
 from plushsense.core import errors
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import layout_names, load_layout
 from plushsense.core.sentences import Message
@@ -183,6 +183,19 @@ def test_a_note_is_in_the_language_of_the_page_also_after_json() -> None:
     assert Words("lv").sentence("something") == "(Angliski:) something"
     older = {"message": "a.txt is left out", "template": "{file}: {note}", "values": {}}
     assert Words("lv").sentence(older) == "(Angliski:) a.txt is left out"
+
+
+def test_a_toy_has_a_name_in_place_of_its_address() -> None:
+    gone = DeviceError(
+        "'{url}' went away ({reason}): was it unplugged or switched off?", url="serial:///dev/x", reason=""
+    )
+    used = ConfigError("{toy} is in use: the page Live reads it.", toy="virtual://?person=7")
+    for language, cable, virtual in (
+        ("en", "Toy on the cable x", "Virtual toy (simulation), person 7"),
+        ("lv", "Rotaļlieta pie kabeļa x", "Virtuāla rotaļlieta (simulācija), 7. cilvēks"),
+    ):
+        assert cable in Words(language).error(gone) and "://" not in Words(language).error(gone)
+        assert Words(language).error(used).startswith(virtual)
 
 
 def test_values_have_the_form_of_the_language() -> None:
