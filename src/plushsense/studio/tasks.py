@@ -538,7 +538,7 @@ def _export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 _SAMPLES = 100_000
 # A few seconds on two cores.
 _TRIAL_EPOCHS = 40
-# The toy is at rest for two seconds between two takes, and nobody practises. Measured in docs/measurements/trial.md.
+# The toy is at rest for two seconds between two takes, and nobody practises. See docs/measurements/live.md.
 _TRIAL_IDLE = {"idle_share": 0.45, "busy_share": 0.1}
 
 

@@ -230,7 +230,7 @@ class _ValueFiller(_FormFiller):
             return words.toy(str(value))
         if key in ("channel", "channels"):
             return words.channel(str(value))
-        return words.gesture(str(value)) if key in ("gesture", "gestures") else value
+        return words.gesture(str(value)) if key in ("gesture", "gestures", "missing") else value
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if isinstance(value, float) and "|" not in format_spec:
