@@ -26,7 +26,7 @@ FILES, RANGE = REFERENCE["FILES"], REFERENCE["RANGE"]
 
 # Dataclasses of files that no user writes: those of the package itself, and JSON that a command writes.
 OF_THE_PACKAGE = {"Target", "Core", "PackageTable", "_ProtocolFile"}
-WRITTEN_BY_COMMANDS = {"Manifest", "Mark", "ModelFacts", "_Intent", "SessionHead"}
+WRITTEN_BY_COMMANDS = {"Manifest", "Mark", "ModelFacts", "Readings", "_Intent", "SessionHead"}
 
 # Values that other keys need, so that a key can have each of its values: None removes a key.
 BESIDE: dict[str, dict[str, Any]] = {

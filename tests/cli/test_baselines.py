@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,23 @@ def test_one_table_of_two_splits_and_what_is_left_behind(cli: Cli, dataset: Data
     assert other.status == 2 and "holds a comparison of other settings" in other.err and other.out == ""
     forced = cli("baselines", dataset.path, "--split", "windows:3", *QUICK, "--out", tmp_path / "OUT", "--force")
     assert forced.status == 0 and "say little about a new person" in forced.out
+
+
+def test_copies_between_people_are_counted_by_split(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    folder = dataset.path
+    first, *_, last = sorted(dataset.used, key=lambda r: r.subject)
+    same = (folder / first.file).read_bytes()
+    (folder / last.file).unlink()
+    (folder / last.file).with_name(Path(first.file).name).write_bytes(same)
+    (folder / "index.json").unlink()
+    words = ("--split", "leave-one-subject-out,windows:3", "--models", "knn", "--features", "statistics", "--pca", "no")
+    ran = cli("baselines", folder, *words, "--workers", 1, "--out", tmp_path / "OUT")
+    assert "so the scores are too high: exclude one of the two recordings" in ran.err
+    splits = json.loads((tmp_path / "OUT" / "baselines.json").read_text(encoding="utf-8"))["splits"]
+    by_people, by_windows = (s["leakage"] for s in splits)
+    assert by_people["shared_rows"] > 0 == by_people["same_person"] and by_windows["same_person"] > 0
+    page = (tmp_path / "OUT" / "baselines.html").read_text(encoding="utf-8")
+    assert "Leakage audit of leave-one-subject-out" in page and "rows of its recording in another" in page
 
 
 def test_our_network_is_the_one_that_evaluate_scores(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:

@@ -113,6 +113,8 @@ def test_excluding_is_a_mark_that_can_be_taken_back(cli: Cli, folder: Path) -> N
     assert "all were there already" in again.err
     ran = cli("check", folder, "--include", ids(folder)[0], "--json")
     assert (ran.status, ran.json["excluded"], ran.json["undecided"]) == (1, 1, 1)
+    ran = cli("check", folder, "--exclude", "clock-reset:*", "--why", "it restarted", "--json")
+    assert (ran.status, ran.json["marked"], ran.json["excluded"]) == (0, 1, 2)
 
 
 @pytest.mark.parametrize(
@@ -121,6 +123,8 @@ def test_excluding_is_a_mark_that_can_be_taken_back(cli: Cli, folder: Path) -> N
         (["--accept", "clock-reset:P2/*"], "need a reason"),
         (["--exclude", "P2/*"], "need a reason"),
         (["--exclude", "P9/*", "--why", "x"], "There is no recording 'P9/*'"),
+        (["--exclude", "gapps:P2/*", "--why", "x"], "There is no check 'gapps'"),
+        (["--exclude", "gaps:P2/*", "--why", "x"], "There is no recording with a finding of 'gaps' 'P2/*'"),
         (["--accept", "clock-reset:P3/*", "--why", "x"], "no finding of 'clock-reset' about 'P3/*'"),
         (["--accept", "clock-rest:P2/*", "--why", "x"], "Did you mean 'clock-reset'"),
         (["--accept", "gaps:P2/*", "--why", "x"], "found nothing"),

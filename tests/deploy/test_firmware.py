@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import re
 import shutil
@@ -16,6 +17,7 @@ import pytest
 from plushsense.core.errors import LayoutError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Channel, Layout, load_layout
+from plushsense.dataset.readings import Readings, Rest
 from plushsense.deploy.code import facts_of
 from plushsense.deploy.golden import answers_of, column, read_golden
 from plushsense.deploy.package import (
@@ -36,6 +38,7 @@ from support.sent_lines import format_line
 from support.virtual_boards import BOARDS, BUILDS, SECONDS, WARNINGS, arduino, compiled, frames_of, idf, play, run, told
 
 Packages = dict[str, tuple[Path, IntegerModel]]
+EYES = {"arduino": (18, 19, 23), "idf": (0, 1, 2)}
 
 
 @pytest.mark.parametrize("board", BUILDS)
@@ -98,6 +101,57 @@ def test_wired_sensors_arrive_in_their_channels(packages: Packages, tmp_path: Pa
     silent = play(BUILDS[board](out, tmp_path, "SENSORS=1", "NO_MOTION"), seconds=1)[0]
     parser = LineParser(model.layout)
     assert all(f.garbage for f in parser.feed(silent)) and parser.counters.garbage > 50
+
+
+@pytest.mark.parametrize("board", BUILDS)
+def test_the_wired_sensor_gets_the_scale_of_the_training_and_another_is_noticed(tmp_path: Path, board: str) -> None:
+    """The made-up sensor's readings never change; they are 1.66 times too large."""
+    rest = Rest(("x", "y", "z"), (4.0, -56.0, 42.0), 7948.0, False)
+    bundle = replace(
+        bundle_of(window=60), readings=Readings((55.0, -1425.0, 4964.0), (7177.0, 6990.0, 6833.0), (rest,))
+    )
+    out = emit(integer_model(bundle), bundle, tmp_path / "out").folder
+    sent, pins = play(BUILDS[board](out, tmp_path, "SENSORS=1"), seconds=6)
+    axes = [(0x3B + 2 * i) * 256 + 0x3C + 2 * i for i in range(3)]
+    scaled = [a * (65536 * 7948 // 16384) // 65536 for a in axes]
+    assert frames_of(bundle.layout, sent)[-1, 1:].tolist() == [
+        a + round(z) for a, z in zip(scaled, rest.zero, strict=True)
+    ]
+    red, green, blue = ([row[2] for row in pins if row[0] > 3100 and row[1] == pin] for pin in EYES[board])
+    assert red == green and max(red) > 200 and not any(blue), "the eyes glow yellow"
+    said = play(BUILDS[board](out, tmp_path, "SENSORS=1", "TELL_ANSWERS=1"), seconds=6)[0].decode()
+    length = math.isqrt(sum(a * a for a in scaled))
+    assert said.count(f"at rest 1 g is {length}, in training it was 7948\n") == 1
+    fake = (out / SKETCH / "plush_fake.c").read_text(encoding="utf-8")
+    assert "{55, 7177}, /* x */" in fake and "{-1425, 6990}, /* y */" in fake and "{4964, 6833}, /* z */" in fake
+
+
+def test_another_scale_is_noticed_at_rest_only(tmp_path: Path, c_compiler: str) -> None:
+    bundle = bundle_of(window=60)
+    for gravity in (7948.0, 2.0**28):
+        rest = Rest(("x", "y", "z"), (0.0, 100.0, 0.0), gravity, False)
+        known = replace(bundle, readings=Readings((0.0,) * 3, (1.0,) * 3, (rest,)))
+        out = emit(integer_model(known), known, tmp_path / f"{gravity:g}").folder
+        words = [c_compiler, "-std=c99", *WARNINGS, f"-I{out}", "-shared", "-fPIC"]
+        run(*words, out / SKETCH / "plush_rest.c", "-o", library := tmp_path / f"{gravity:g}.so")
+        check = ctypes.CDLL(str(library)).plush_rest_check
+        t = np.arange(500) / 100
+        still, moving = np.ones(500), 1 + 0.4 * np.sin(9 * t)
+        lengths = [(share * still, None) for share in (1.0, 0.7, 1.4)] + [(share * still, 3) for share in (2.06, 0.49)]
+        lengths += [(2.06 * moving, None), (np.where(t < 2, 2.06, 1.0), None)]
+        lengths += [(np.where((t < 2) | (t >= 3), 2.06, 2 * moving), 4)]
+        for length, seconds in lengths:
+            state = ctypes.create_string_buffer(64)
+            rows = np.rint(np.outer(length * gravity, [0.6, 0.0, 0.8])).astype(np.int64) + np.array([0, 100, 0])
+            found = [n for n, row in enumerate(rows.tolist()) if check(state, 5 + 10 * n, (ctypes.c_int32 * 3)(*row))]
+            assert found == ([] if seconds is None else [100 * seconds]), (gravity, length[:5])
+
+
+def test_a_bundle_of_before_exports_and_says_that_the_scale_is_not_known(packages: Packages) -> None:
+    for layout, (out, _) in packages.items():
+        text, header = (out / "README.md").read_text(encoding="utf-8"), (out / "plush_model.h").read_text()
+        assert text.count("export --dataset DS measures it") == 1 and "PLUSH_MODEL_ONE_G" not in header
+        assert ("ITS SCALE IS NOT KNOWN" in (out / SKETCH / "PlushToy.ino").read_text()) == (layout != "phone-6")
 
 
 @pytest.mark.parametrize("board", BUILDS)

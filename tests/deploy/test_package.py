@@ -160,6 +160,77 @@ def test_cmake_builds_it_as_a_folder_as_a_package_and_as_a_zephyr_module(
         run(user / "build" / "user")
 
 
+_PARENT = """cmake_minimum_required(VERSION 3.13)
+project(parent LANGUAGES C)
+{before}
+add_subdirectory("{out}" one)
+add_library(parent STATIC user.c)
+target_link_libraries(parent PUBLIC plushsense::plushsense)
+install(TARGETS parent EXPORT parent ARCHIVE DESTINATION lib)
+install(EXPORT parent FILE parent-targets.cmake DESTINATION lib/cmake/parent)
+{after}
+"""
+
+
+def test_cmake_optimises_unless_it_is_asked_otherwise_and_a_parent_installs_it(
+    packages: Packages, needs: Callable[..., None], tmp_path: Path
+) -> None:
+    needs("cmake", "gcc")
+    out = packages["accel-3"][0]
+    (tmp_path / "user.c").write_text('#include "plushsense.h"\nint user(void);\nint user(void)\n{\n    return 0;\n}\n')
+
+    def configured(*words: str, before: str = "", after: str = "") -> subprocess.CompletedProcess[str]:
+        shutil.rmtree(tmp_path / "build", ignore_errors=True)
+        text = _PARENT.format(out=out, before=before, after=after)
+        (tmp_path / "CMakeLists.txt").write_text(text)
+        known = ("-DCMAKE_C_COMPILER_WORKS=1", "-DCMAKE_EXPORT_COMPILE_COMMANDS=1")  # the first saves time
+        command = ["cmake", *known, *words, "-S", str(tmp_path), "-B", str(tmp_path / "build")]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    def optimised(*words: str, before: str = "") -> list[str]:
+        done = configured(*words, before=before)
+        assert done.returncode == 0, done.stderr
+        rows = json.loads((tmp_path / "build" / "compile_commands.json").read_text(encoding="utf-8"))
+        (command,) = (row["command"] for row in rows if row["file"].endswith("plushsense.c"))
+        return re.findall(r" (-O\w+)", command)
+
+    assert optimised() == ["-O2"]
+    assert optimised("-DCMAKE_BUILD_TYPE=Debug") == [] and optimised("-DCMAKE_BUILD_TYPE=MinSizeRel") == ["-Os"]
+    assert optimised("-DCMAKE_C_FLAGS=-Og") == ["-Og"]
+    assert optimised(before="add_compile_options(-Os)")[-1] == "-Os"
+    twice = configured(after=f'add_subdirectory("{out}" two)')
+    assert twice.returncode and "--name ears" in twice.stderr
+
+
+def test_the_component_is_found_whatever_its_folder_is_called(packages: Packages, tmp_path: Path) -> None:
+    """Field names are those that idf-component-manager 3.1.2 knows: its `compote` lets misspelt ones through."""
+    known = {"name", "version", "targets", "maintainers", "description", "license", "tags", "dependencies", "overrides"}
+    known |= {"files", "examples", "sbom", "url", "repository", "documentation", "issues", "discussion", "changelog"}
+    known |= {"repository_info"}
+    component = Path(shutil.copytree(packages["plush-15"][0] / IDF, tmp_path / "acme__ears"))
+    manifest = (component / "idf_component.yml").read_text(encoding="utf-8")
+    fields = re.findall(r"^(\w+):", manifest, re.M)
+    assert set(fields) <= known and len(set(fields)) == len(fields)
+    # A list of chips would refuse each newer one, and linux.
+    assert "targets" not in fields and re.findall(r"^  (\w+): \"(.*)\"$", manifest, re.M) == [("idf", ">=5.2")]
+    readme = (packages["plush-15"][0] / "README.md").read_text(encoding="utf-8")
+    assert "ESP-IDF 5.2 and newer" in readme and "5.x" not in readme
+    stub = 'function(idf_component_register)\n    message(STATUS "${ARGN}")\nendfunction()\n'
+    for example in ("PlushToy", "RtosToy"):
+        for major in (5, 6):
+            script = tmp_path / "script.cmake"
+            lists = component / "examples" / example / "main" / "CMakeLists.txt"
+            script.write_text(f'set(IDF_VERSION_MAJOR {major})\n{stub}include("{lists}")\n')
+            done = subprocess.run(["cmake", "-P", script], capture_output=True, text=True)
+            words = done.stdout.split("PRIV_REQUIRES;")[1].strip().split(";")
+            assert words[0] == "acme__ears"
+            drivers = ["esp_driver_i2c", "esp_driver_ledc", "esp_driver_uart"] if major > 5 else ["driver"]
+            assert example == "RtosToy" or words[1:] == [*drivers, "esp_timer"]
+    for tool in filter(None, [shutil.which("compote")]):
+        run(tool, "manifest", "lint", component)
+        run(tool, "component", "pack", "--name", "ears", "--project-dir", component, "--dest-dir", tmp_path / "dist")
+
+
 def test_the_model_s_own_version_and_page_stand_in_every_manifest_and_in_c(tmp_path: Path, c_compiler: str) -> None:
     """A toy tells which model it runs, also after a swap; the header tells version and training."""
     hashed = "0123456789abcdef" * 4
@@ -228,13 +299,13 @@ def test_what_the_manifests_name_exists(packages: Packages) -> None:
         words = [row.split("\t") for row in (library / "keywords.txt").read_text().splitlines()]
         assert all(len(row) == 2 for row in words) and ["plush_push", "KEYWORD2"] in words
         for cmake in (*(out / IDF).rglob("CMakeLists.txt"), *(out / IDF_EXAMPLE).rglob("CMakeLists.txt")):
-            for named in re.findall(r'"([^"$]+)"', cmake.read_text()):
+            for named in re.findall(r'"([^"$\s]+)"', cmake.read_text()):
                 assert (cmake.parent / named).exists(), named
             for named in re.findall(r"CMAKE_CURRENT_LIST_DIR}/([^\"]+)", cmake.read_text()):
                 assert (cmake.parent / named / "CMakeLists.txt").is_file()
         assert re.fullmatch(
             r'version: "[\d.]+"\ndescription: ".*"\nlicense: MIT\nurl: "https?://\S+"\n'
-            r'targets: \[esp32(, esp32\w+)+\]\ndependencies:\n  idf: ".*"\n',
+            r'dependencies:\n  idf: ">=5.2"\n',
             (out / IDF / "idf_component.yml").read_text(encoding="utf-8"),
         )
         component = (out / IDF / "CMakeLists.txt").read_text()

@@ -254,7 +254,7 @@ def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
 def test_a_file_under_two_labels_and_a_long_window_are_named(
     dataset: Dataset, make_session: Callable[[Path, int], None], tmp_path: Path
 ) -> None:
-    from plushsense.dataset.statistics import median_gesture_s
+    from plushsense.dataset.statistics import fitting_window_s, median_gesture_s
     from plushsense.models.arch import Arch
     from plushsense.windows.cut import WindowSpec
     from plushsense.workflow.preparation import warn_of_files_twice, warn_of_long_windows
@@ -285,6 +285,10 @@ def test_a_file_under_two_labels_and_a_long_window_are_named(
     kernels = of("14d1_39d2_41d4", 1.0, padding="mirror")
     assert "kernels 2.5 s, window 1 s" in kernels and "try --arch " in kernels and "window_s" not in kernels
     assert of(kernels.rpartition(" ")[2], 1.0) == ""
+    # Whoever follows an advice gets no other one.
+    assert of("14d1", 2.3) == of("14d1_19d2_19d4", 2.3) == of("14d1_19d2_19d4", 1.3) == ""
+    assert "a decision then reads" in of("79d1_39d2_19d4", 2.5) and of("79d1_39d2_19d4", 2.3) == ""
+    assert [fitting_window_s(s) for s in (2.325, 0.8, 0.75, 0.3)] == [2.3, 0.8, 0.7, 0.5]
 
 
 def test_a_gesture_of_one_person_is_named(dataset: Dataset) -> None:

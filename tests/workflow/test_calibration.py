@@ -10,6 +10,7 @@ import pytest
 
 import plushsense as ps
 from plushsense.core.errors import ArchError, BundleError, ConfigError
+from plushsense.dataset.readings import Readings
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.quantize import calibration, integer_model
 from plushsense.models.bundle import Bundle
@@ -35,6 +36,8 @@ def test_training_calibrates_on_the_windows_it_trained_on_and_no_others(dataset:
     again = calibrated_on(replace(bundle, calibration={}), dataset)
     assert again.calibration == bundle.calibration
     assert integer_model(again).to_bytes() == integer_model(bundle).to_bytes()
+    assert bundle.readings == Readings.of(dataset, bundle.provenance["subjects"])
+    assert calibrated_on(replace(bundle, readings=None), dataset).readings == bundle.readings
 
 
 def test_data_of_other_content_is_used_with_a_word_and_of_other_people_refused(dataset: Dataset) -> None:

@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
             *simulated,
             f"  model             {facts.flash_bytes:,} bytes of flash, without the code (see plushsense profile)",
             f"  memory            {facts.ram_bytes:,} bytes of RAM",
+            *(f"  accelerometer     {rest.sentence}" for rest in facts.rest),
             f"  a step            {facts.step_ms:g} ms, {facts.macs_per_step:,} MACs",
             *(_conversion(entry) for entry in facts.conversions.values()),
             f"  prove it          plushsense verify {args.out}",

@@ -372,6 +372,14 @@ class Layout:
         kinds = {c.name: c.kind for c in self.channels}
         return any(kinds[axis] == ACCELERATION for vector in self.vectors for axis in vector)
 
+    @property
+    def accelerometers(self) -> tuple[tuple[str, ...], ...]:
+        """The axes of each accelerometer: of vectors or magnitudes, or the only three channels of the kind."""
+        groups = self.vectors or tuple(d.of for d in self.derived if d.kind == "magnitude")
+        axes = tuple(c.name for c in self.channels if c.kind == ACCELERATION)
+        found = tuple(group for group in groups if set(group) <= set(axes))
+        return found or ((axes,) if len(axes) == 3 else ())
+
     def for_vectors(self) -> Layout:
         """Return the layout with the inputs of a network that begins with a vector layer (see `models.arch`).
 

@@ -342,7 +342,7 @@ def _recordings_from_files(
             gestures[name.label] = head.gestures.find(name.label)
         gesture = gestures[name.label]
         named.append((read, name, gesture.label if gesture else name.label))
-    usual = usual_rows((label, len(read.result.frames)) for read, _, label in named)
+    usual = usual_rows((label, read.subject, len(read.result.frames)) for read, _, label in named)
     by_subject: dict[str, list[_RawFile]] = {}
     for stream in streams:
         by_subject.setdefault(stream.subject, []).append(stream)

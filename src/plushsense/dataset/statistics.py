@@ -5,6 +5,7 @@ They have the statistics of the authors' ``b_training_data_analysis.m``: mean, m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -128,3 +129,8 @@ def median_gesture_s(dataset: Dataset, gestures: Iterable[str] | None = None) ->
         if chosen is None or r.gesture in chosen
     ]
     return float(np.median(seconds)) if seconds else None
+
+
+def fitting_window_s(usual_s: float) -> float:
+    """Return the longest window in tenths of a second, from 0.5 s, that is no longer than the usual gesture."""
+    return max(0.5, math.floor(10.0 * usual_s + 1e-6) / 10.0)

@@ -383,6 +383,11 @@ class Dataset:
         recordings = [replace(r, gesture=names.get(r.gesture, r.gesture)) for r in self.recordings]
         return self._copy(head, recordings)
 
+    def only_people(self, people: Iterable[str]) -> Dataset:
+        """Return this data set with the recordings of some people only."""
+        chosen = set(people)
+        return self._copy(self.head, [r for r in self.recordings if r.subject in chosen])
+
     def without_stretches(self) -> Dataset:
         """Return this data set without the labels of `stretches`, as if no stream had any."""
         other = self._copy(self.head, self.recordings)

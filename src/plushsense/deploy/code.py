@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
@@ -13,6 +14,7 @@ from typing import Any
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.files import read_bytes
+from plushsense.core.sentences import join_names
 from plushsense.core.templates import fill_text
 from plushsense.core.toml import load_table
 from plushsense.models.bundle import Bundle
@@ -28,6 +30,7 @@ FACTS = "export.json"
 MOST_FILE_BYTES = 16 << 20  # that are read of a file of an export, other than golden vectors
 TOY_BYTES = 516  # size of a plush_toy with 32-bit pointers (a test compiles it)
 
+_FAR_ZERO = 0.05
 _MOST_NAME = 10  # so that an Arduino library called NAME_plush has at most the 16 characters that arduino-lint accepts
 _NAME = re.compile(r"(?!.*(?:arduino|library))[a-z][a-z0-9]*(?:_[a-z0-9]+)*")
 # https://semver.org: what the manifests of Arduino, PlatformIO and ESP-IDF all accept.
@@ -47,6 +50,39 @@ class ChannelFacts:
 
     name: str
     unit: str
+
+
+@dataclass(frozen=True)
+class RestFacts:
+    """What an accelerometer reads while it is held still: 1 g.
+
+    ``value`` is the length of its ``channels`` in ``unit``, as lines and files have them, ``steps`` the same in the
+    integers of the C, less ``zero``; ``steps`` is 0 if it is not known. ``is_estimated`` as in
+    `plushsense.dataset.readings.Rest`.
+    """
+
+    channels: tuple[str, ...]
+    steps: int = 0
+    value: float = 0.0
+    unit: str = ""
+    zero: tuple[int, ...] = (0, 0, 0)
+    is_estimated: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """What is known, for people."""
+        length = f"|{', '.join(self.channels)}|"
+        if not self.steps:
+            return (
+                f"what {length} reads at rest, so its scale, is not known: the bundle is of an earlier PlushSense; "
+                "export --dataset DS measures it"
+            )
+        # In a sentence, a small zero would only distract.
+        far = math.hypot(*self.zero) > _FAR_ZERO * self.steps
+        zero = f" around {join_names(self.zero)}" if far else ""
+        unit = "counts" if self.unit == "count" else self.unit
+        doubt = "; estimated, as the recordings do not determine it" if self.is_estimated else ""
+        return f"at rest {length}{zero} is about {self.value:,g} {unit}".rstrip() + doubt
 
 
 @dataclass(frozen=True)
@@ -78,6 +114,7 @@ class ModelFacts:
     layout: str
     layout_check: int
     channels: tuple[ChannelFacts, ...]
+    rest: tuple[RestFacts, ...] = ()
     inputs: tuple[str, ...]
     classes: int
     gestures: tuple[GestureFacts, ...]
@@ -120,7 +157,7 @@ class ModelFacts:
 
     def to_json(self) -> dict[str, object]:
         """Return the content of ``export.json``; what is empty by default is left out."""
-        optional = ("personal", "name", "url", "conversions", "files")
+        optional = ("personal", "name", "url", "conversions", "files", "rest")
         return {key: value for key, value in asdict(self).items() if value or key not in optional}
 
 
@@ -241,6 +278,7 @@ def facts_of(model: IntegerModel, bundle: Bundle, image: bytes) -> ModelFacts:
         layout=layout.name,
         layout_check=layout_check(layout),
         channels=tuple(ChannelFacts(c.name, c.unit) for c in layout.channels),
+        rest=rest_facts(bundle),
         inputs=layout.inputs,
         classes=arch.classes,
         gestures=tuple(
@@ -269,6 +307,21 @@ def facts_of(model: IntegerModel, bundle: Bundle, image: bytes) -> ModelFacts:
         personal=bundle.personal,
         code_version=code_version,
     )
+
+
+def rest_facts(bundle: Bundle) -> tuple[RestFacts, ...]:
+    """Return what each accelerometer reads at rest, but for those that calibrate themselves or show no gravity."""
+    layout, readings = bundle.layout, bundle.readings
+    groups = [axes for axes in layout.accelerometers if not set(axes) & set(layout.self_calibration)]
+    if readings is None:
+        return tuple(map(RestFacts, groups))
+    found = []
+    for rest in readings.rest:
+        if rest.axes in groups:
+            channel, steps = layout.channels[layout.index(rest.axes[0])], max(1, round(rest.one_g))
+            value, zero = float(f"{rest.one_g * channel.step:.4g}"), tuple(map(round, rest.zero))
+            found.append(RestFacts(rest.axes, steps, value, channel.unit, zero, rest.is_estimated))
+    return tuple(found)
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, LayoutError
 from plushsense.core.files import new_folder, read_bytes
-from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Channel, Layout
+from plushsense.core.layouts import ACCELERATION, DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.core.templates import c_comment, fill_text
+from plushsense.dataset.readings import Readings, Rest
 from plushsense.deploy.code import (
     BUNDLE,
     FACTS,
@@ -51,8 +52,9 @@ ON_CHIP = "examples/verify_device"
 _DEVICE = ("plush_device.h", "plush_device.c", "plush_hooks.c")
 # Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
 NO_PAGE = "https://plushsense.invalid/"
+IDF_SINCE = "5.2"  # of ESP-IDF; the examples use its driver of I2C, which is new there
 _WIRE = ("plush_wire.h", "plush_wire.c")
-_EXAMPLE = ("plush_reaction.h", "plush_reaction.c", "plush_fake.h", "plush_fake.c")
+_EXAMPLE = tuple(f"plush_{part}.{kind}" for part in ("reaction", "fake", "rest") for kind in "hc")
 FIRMWARE = (*_WIRE, *_EXAMPLE, "PlushToy.ino", "main.c")
 """Files of the example firmware, with templates in ``c/toy``."""
 _TEMPLATES = {
@@ -82,7 +84,7 @@ def export_files(bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes]) -
     Raises:
         LayoutError: for a layout with values that the toy's line format cannot represent.
     """
-    rendered = firmware(bundle.layout, bundle.scaler, facts)
+    rendered = firmware(bundle.layout, bundle.scaler, facts, bundle.readings)
     name = facts.name
     header = prefixed(code[LIBRARY[0]].decode(), name)
     c_folder = files("plushsense.deploy") / "c"
@@ -95,6 +97,7 @@ def export_files(bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes]) -
     values = {
         "version": facts.model_version,
         "url": facts.url or NO_PAGE,
+        "idf_versions": f">={IDF_SINCE}",
         **_folders(name),
         "author": "The PlushSense developers",
         "sentence": "What a soft toy feels: a small streaming network in whole numbers.",
@@ -190,6 +193,7 @@ def handbook(bundle: Bundle, facts: ModelFacts) -> str:
     return _fill(
         "templates/README.md",
         facts=facts,
+        idf=IDF_SINCE,
         **_folders(facts.name),
         channels=list(zip(layout.channels, c_names(layout.names), *ranges, strict=True)),
         provenance=bundle.provenance,
@@ -222,11 +226,12 @@ def _keywords(headers: str) -> str:
 # Touch pads of the ESP32 as (pad, GPIO); the last ones are strapping pins, which also decide how the chip boots.
 _PADS = ((0, 4), (3, 15), (4, 13), (6, 14), (7, 27), (8, 33), (9, 32), (2, 2), (5, 12), (1, 0))
 _NO_PAD = 255
-# One count of the MPU-6050 in several units, by kind of channel.
+# 1 g in several units, and one count of the MPU-6050's gyroscope.
 _MOTION = {
-    "acceleration": {"count": 1.0, "g": 1 / 16384, "m/s²": 9.80665 / 16384, "m/s2": 9.80665 / 16384},
-    "angular rate": {"count": 1.0, "°/s": 1 / 131, "deg/s": 1 / 131, "rad/s": math.radians(1 / 131)},
+    ACCELERATION: {"g": 1.0, "mg": 1000.0, "m/s²": 9.80665, "m/s2": 9.80665},
+    "angular rate": {"°/s": 1 / 131, "deg/s": 1 / 131, "rad/s": math.radians(1 / 131)},
 }
+_MPU_ONE_G = 16384
 _FIRST_AXIS = {"acceleration": 0, "angular rate": 3}
 _PADDED = ("capacitive", "proximity")
 # Channels that are sums of others (the paper's Table 1: "cumulative signal, based on all the capacitive sensors").
@@ -236,27 +241,31 @@ _MOST_DECIMALS = 9
 
 @dataclass(frozen=True)
 class _ChannelSource:
-    """Source of a channel: ``kind`` of the C enum, touch pad and GPIO (or the axis twice), factor in 1/65536."""
+    """Source of a channel: ``kind`` of the C enum, touch pad and GPIO (or the axis twice), factor as C code, zero."""
 
     kind: str
     pad: int = 0
     pin: int = 0
-    factor: int = 0
+    factor: str = "0"
+    zero: int = 0
     note: str = ""
 
 
-def firmware(layout: Layout, scaler: Scaler, facts: ModelFacts) -> dict[str, str]:
+def firmware(layout: Layout, scaler: Scaler, facts: ModelFacts, readings: Readings | None = None) -> dict[str, str]:
     """Render the files of `FIRMWARE` for a model with these ``facts`` (of ``export.json``), by name.
+
+    ``readings`` are those of the training, if they are known.
 
     Raises:
         LayoutError: for a channel whose step the toy's line format cannot represent.
     """
-    sources = _sources(layout)
+    sources = _sources(layout, readings)
     formats = [_decimal_format(c) for c in layout.channels]
     names = {c.name: f"PLUSH_CHANNEL_{n}" for c, n in zip(layout.channels, c_names(layout.names), strict=True)}
     indent = " *     "
     values = {
         "title": c_comment(facts.title),
+        "idf": IDF_SINCE,
         "layout": c_comment(layout.name),
         "classes": facts.classes,
         "period_ms": f"{layout.period_us / 1000:g}",
@@ -268,6 +277,8 @@ def firmware(layout: Layout, scaler: Scaler, facts: ModelFacts) -> dict[str, str
         "line_bytes": _line_bytes(layout, formats),
         "wire": [names.get(field, field.upper()) for field in layout.wire],
         "kinds": {s.kind for s in sources},
+        "one_g": _MPU_ONE_G,
+        "rest": [layout.index(name) for rest in facts.rest[:1] if rest.steps for name in rest.channels],
         "channels": [
             {
                 "name": c_comment(channel.name),
@@ -277,20 +288,21 @@ def firmware(layout: Layout, scaler: Scaler, facts: ModelFacts) -> dict[str, str
                 "usual": f"{{{mean}, {spread}}}",
             }
             for channel, source, (times, decimals), (mean, spread) in zip(
-                layout.channels, sources, formats, _statistics(layout, scaler), strict=True
+                layout.channels, sources, formats, _statistics(layout, scaler, readings), strict=True
             )
         ],
     }
     return {name: _fill(f"c/toy/{name}", **values) for name in FIRMWARE}
 
 
-def _sources(layout: Layout) -> list[_ChannelSource]:
+def _sources(layout: Layout, readings: Readings | None) -> list[_ChannelSource]:
     sources: list[_ChannelSource] = []
     pads = iter(_PADS)
     axes = dict(_FIRST_AXIS)
     others = 0
+    known = {name: rest for rest in (readings.rest if readings else ()) for name in rest.axes}
     for channel in layout.channels:
-        factor = _motion_factor(channel)
+        factor, zero, note = _motion_factor(channel, known.get(channel.name))
         if channel.kind in _PADDED and channel.step == 1.0:
             if channel.name in _TOTALS:
                 sources.append(_ChannelSource("TOTAL", note=": the sum of all pads"))
@@ -298,8 +310,8 @@ def _sources(layout: Layout) -> list[_ChannelSource]:
                 sources.append(_ChannelSource("TOUCH", *pad))
             else:
                 sources.append(_ChannelSource("TOUCH", _NO_PAD, _NO_PAD, note=": NO PAD IS LEFT for it"))
-        elif factor is not None and axes[channel.kind] < _FIRST_AXIS[channel.kind] + 3:
-            sources.append(_ChannelSource("MOTION", axes[channel.kind], axes[channel.kind], factor))
+        elif factor and axes[channel.kind] < _FIRST_AXIS[channel.kind] + 3:
+            sources.append(_ChannelSource("MOTION", axes[channel.kind], axes[channel.kind], factor, zero, note))
             axes[channel.kind] += 1
         else:
             sources.append(_ChannelSource("OTHER", others, others, note=": see read_other()"))
@@ -307,13 +319,24 @@ def _sources(layout: Layout) -> list[_ChannelSource]:
     return sources
 
 
-def _motion_factor(channel: Channel) -> int | None:
-    """Return the factor from sensor counts to steps of the channel, in 1/65536; None if it cannot be computed."""
-    unit = _MOTION.get(channel.kind, {}).get(channel.unit)
-    if unit is None or channel.offset != 0:
-        return None
-    factor = round(65536 * unit / ((1.0 if channel.unit == "count" else channel.scale) * channel.step))
-    return factor if 0 < abs(factor) < 1 << 31 else None
+def _motion_factor(channel: Channel, rest: Rest | None) -> tuple[str, int, str]:
+    """Return C code of the factor from sensor counts to steps of the channel, in 1/65536, the zero, and a note.
+
+    The factor is "" if it cannot be computed. 1 g in steps is what was measured, else what the unit says, else what was
+    estimated.
+    """
+    zero, unit = round(channel.offset / channel.step), _MOTION.get(channel.kind, {}).get(channel.unit, 0.0)
+    steps = unit / (channel.scale * channel.step)
+    if rest is not None and not (rest.is_estimated and steps):
+        steps, zero = math.copysign(rest.one_g, channel.scale), round(rest.zero[rest.axes.index(channel.name)])
+    if channel.kind == ACCELERATION and steps:
+        one_g = round(steps) or int(math.copysign(1, steps))
+        return (f"ONE_G({one_g})" if abs(one_g) < _MPU_ONE_G << 15 else ""), zero, ""
+    note = ""
+    if channel.kind in _MOTION and channel.unit == "count":
+        steps, note = 1.0 / channel.step, ": ITS SCALE IS NOT KNOWN"
+    factor = round(65536 * steps)
+    return (str(factor) if 0 < abs(factor) < 1 << 31 else ""), zero, note
 
 
 def _decimal_format(channel: Channel) -> tuple[int, int]:
@@ -336,12 +359,12 @@ def _line_bytes(layout: Layout, formats: list[tuple[int, int]]) -> int:
     return clocks + values + len(layout.wire) + 1
 
 
-def _statistics(layout: Layout, scaler: Scaler) -> list[tuple[int, int]]:
-    """Return mean and spread of each channel in training by `measured`, limited to the valid range."""
-    mean, spread = measured(layout, scaler)
+def _statistics(layout: Layout, scaler: Scaler, readings: Readings | None) -> list[tuple[int, int]]:
+    """Return mean and spread of each channel in training, else by `measured`, limited to the valid range."""
+    mean, spread = measured(layout, scaler) if readings is None else (readings.mean, readings.spread)
     rows = []
     for at, wide, low, high in zip(
-        mean.tolist(), spread.tolist(), layout.valid_min_int.tolist(), layout.valid_max_int.tolist(), strict=True
+        mean, spread, layout.valid_min_int.tolist(), layout.valid_max_int.tolist(), strict=True
     ):
         middle = min(max(round(at), low), high)
         rows.append((middle, min(round(wide), (high - middle) // 2, (middle - low) // 2)))

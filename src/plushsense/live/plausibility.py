@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.layouts import ACCELERATION, GRAVITY_FRACTION_BITS, MAGNITUDE_FRACTION_BITS, Layout
+from plushsense.core.layouts import GRAVITY_FRACTION_BITS, MAGNITUDE_FRACTION_BITS, Layout
 from plushsense.core.sentences import Message
 from plushsense.devices.base import Frame
 from plushsense.models.bundle import Bundle
@@ -37,7 +37,8 @@ _UNITS = ((1 / 9.81, "g, not m/s²"), (9.81, "m/s², not g"), (1000.0, "thousand
 def gravity_in_training(bundle: Bundle, axes: Sequence[int]) -> tuple[float, bool] | None:
     """Return the length of gravity in the training data, in steps, for the channels ``axes`` of an accelerometer.
 
-    It follows from the scaling of the inputs: of the gravity itself, else of the magnitude, else of the axes.
+    It is that of the bundle's readings, else it follows from the scaling of the inputs: of the gravity itself, else of
+    the magnitude, else of the axes.
 
     Returns:
         The length, and whether it is certain; else it is the root mean square of all accelerations, movement included.
@@ -45,6 +46,9 @@ def gravity_in_training(bundle: Bundle, axes: Sequence[int]) -> tuple[float, boo
     """
     layout, scaler = bundle.layout, bundle.scaler
     names = [layout.names[axis] for axis in axes]
+    for rest in bundle.readings.rest if bundle.readings else ():
+        if rest.axes == tuple(names) and not rest.is_estimated:
+            return rest.one_g, True
     derived = {d.of: layout.inputs.index(d.name) for d in layout.derived if d.name in layout.inputs}
     mean, spread = np.asarray(scaler.offset), 1.0 / np.asarray(scaler.scale)
     if not scaler.knows_training(layout):
@@ -105,7 +109,8 @@ class PlausibilityMonitor:
         self._low, self._high = np.full(layout.n_channels, -np.inf), np.full(layout.n_channels, np.inf)
         if bundle is not None:
             low, high = ranges_in_training(bundle)
-            for axes in _accelerometers(layout):
+            for names in layout.accelerometers:
+                axes = [layout.index(name) for name in names]
                 # What an axis reads depends on how the toy is held: as much as any of them, in either direction.
                 zero = layout.zero_int[axes]
                 reach = np.maximum(high[axes] - zero, zero - low[axes]).max()
@@ -215,15 +220,6 @@ class PlausibilityMonitor:
         unit = channel.in_units(0.0)[1]
         usual = f"{first:.4g} to {last:.4g}{unit} of the training"
         return f"{channel.name} reads {low:.4g} to {high:.4g}{unit}, outside {usual}"
-
-
-def _accelerometers(layout: Layout) -> list[list[int]]:
-    """Return the indices of the axes of each accelerometer: of vectors or magnitudes, or the only three of the kind."""
-    groups = layout.vectors or tuple(d.of for d in layout.derived if d.kind == "magnitude")
-    found = [[layout.index(name) for name in group] for group in groups]
-    all_axes = [at for at, channel in enumerate(layout.channels) if channel.kind == ACCELERATION]
-    found = [axes for axes in found if set(axes) <= set(all_axes)]
-    return found or ([all_axes] if len(all_axes) == 3 else [])
 
 
 def _value(value: tuple[float, str]) -> str:

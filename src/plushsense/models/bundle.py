@@ -11,7 +11,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ from plushsense.core.errors import BadInput, BundleError
 from plushsense.core.files import check_output_file, read_bytes, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
-from plushsense.core.toml import check_table
+from plushsense.core.toml import check_table, load_table
+from plushsense.dataset.readings import Readings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.models.arch import Arch
 from plushsense.models.reference import CHUNK, Network, check_weights
@@ -115,6 +116,7 @@ class Bundle:
         provenance: origin of the weights: data set hash, subjects, code version, split, scores.
         calibration: value ranges in training windows, for 8-bit scales (``deploy/quantize``); no samples. May be empty.
         personal: for whom the dense layer was adapted, and the layer before (`plushsense.live.adaptation`); or empty.
+        readings: what the sensors read in the training recordings; None: unknown, as in bundles of earlier versions.
 
     Raises:
         BundleError: if the parts do not fit together, or a number is out of range.
@@ -130,6 +132,7 @@ class Bundle:
     provenance: dict[str, Any] = field(default_factory=dict)
     calibration: dict[str, Any] = field(default_factory=dict)
     personal: dict[str, Any] = field(default_factory=dict)
+    readings: Readings | None = None
 
     def __post_init__(self) -> None:
         check_weights(self.arch, self.weights)
@@ -153,6 +156,8 @@ class Bundle:
         for name, weight in self.weights.items():
             if np.size(weight) and np.abs(weight).max() > _MOST_WEIGHT:
                 raise BundleError(f"The weights '{name}' hold a value beyond ±{_MOST_WEIGHT:g}: train again.")
+        if self.readings is not None and (problem := self.readings.problem(self.layout)):
+            raise BundleError(f"The readings in the bundle hold {problem}: train again.")
         _check_size(self.arch, self.layout)
 
     def __repr__(self) -> str:
@@ -258,6 +263,7 @@ class Bundle:
                 content["provenance"],
                 content.get("calibration", {}),
                 content.get("personal", {}),
+                load_table(content["readings"], Readings, "readings", BundleError) if "readings" in content else None,
             )
             implied = bundle._implied()
             changed = [key for key in implied if content.get(key) != implied[key]]
@@ -312,6 +318,7 @@ class Bundle:
                 "provenance": self.provenance,
                 **({"calibration": self.calibration} if self.calibration else {}),
                 **({"personal": self.personal} if self.personal else {}),
+                **({"readings": asdict(self.readings)} if self.readings else {}),
                 **self._implied(),
             }
         )

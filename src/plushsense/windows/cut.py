@@ -330,7 +330,7 @@ def drop_long_recordings(
     recordings: list[RecordingInfo], spec: WindowSpec
 ) -> tuple[list[RecordingInfo], list[Message]]:
     """Return the recordings to cut, and a description of each recording that was not stopped in time."""
-    usual = usual_rows((r.gesture, r.stop - r.start) for r in recordings)
+    usual = usual_rows((r.gesture, r.subject, r.stop - r.start) for r in recordings)
     in_time, left_out = list[RecordingInfo](), list[Message]()
     for r in recordings:
         own_file = r.file.startswith(f"{RECORDINGS}/")

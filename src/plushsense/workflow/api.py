@@ -24,6 +24,7 @@ from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.quality.copies import copied_recordings
+from plushsense.dataset.readings import Readings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, Generation
 from plushsense.deploy.quantize import (
     QUANTIZE_VERSION,
@@ -256,6 +257,7 @@ def train(
 def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScores, quantize_aware: int) -> Bundle:
     """Return the bundle of a trained network, with the decision settings that were given."""
     run = made.run
+    people = sorted({str(s) for s in made.windows.subject[final.at]})
     anywhere = {"anywhere": asdict(run.anywhere)} if run.windows.context == ANYWHERE else {}
     return Bundle(
         arch=run.network,
@@ -269,7 +271,7 @@ def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScore
             "dataset": run.dataset.head.name,
             "dataset_hash": run.dataset.hash,
             "simulated": run.dataset.head.simulated,
-            "subjects": sorted({str(s) for s in made.windows.subject[final.at]}),
+            "subjects": people,
             "validation_subjects": sorted({str(s) for s in made.scored.subject[made.validation]}),
             "split": made.kind,
             "refit": made.refit,
@@ -281,6 +283,7 @@ def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScore
             "code_version": __version__,
         },
         calibration=final.ranges,
+        readings=Readings.of(run.dataset, people),
     )
 
 

@@ -107,7 +107,7 @@ class DecisionSpec:
 
     Attributes:
         accept, unaccept: ``CHECK:PATTERN``, e.g. ``gaps:P26/*``; ``CHECK`` alone means the data set as a whole.
-        exclude, include: patterns of recordings, e.g. ``P19/*``.
+        exclude, include: patterns of recordings, e.g. ``P19/*``; to exclude, also ``CHECK:PATTERN``.
         why: the reason, required to accept or exclude.
         who: the person who decides; default: the login name.
     """
@@ -142,12 +142,14 @@ def decide(
     dataset = as_dataset(dataset)
     by = {"who": checking.author_name(spec.who) if spec else "", "why": spec.why}
     # Resolve all patterns before marking anything, so that a wrong one does not leave a partial decision.
-    marks = checking.exclusions(dataset, spec.exclude, spec.include, **by)
+    by_check = [*spec.accept, *(entry for entry in spec.exclude if ":" in entry)]
+    for entry in by_check:
+        checking.parse_acceptance(entry)
+    checked = check_dataset(dataset, limits=limits) if by_check else None
+    marks = checking.exclusions(dataset, spec.exclude, spec.include, checked.findings if checked else (), **by)
     marks += checking.withdrawals(dataset, spec.unaccept, **by)
-    for acceptance in spec.accept:
-        checking.parse_acceptance(acceptance)
-    if spec.accept:
-        marks += checking.acceptances(check_dataset(dataset, limits=limits), spec.accept, **by)
+    if checked:
+        marks += checking.acceptances(checked, spec.accept, **by)
     marked = dataset.append_marks(marks)
     if marked:
         dataset = as_dataset(dataset.path)

@@ -17,6 +17,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.saved_windows import SETS, SIMULATED
 from plushsense.dataset.index import as_dataset
+from plushsense.dataset.readings import Readings
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.code import IMAGE, check_names, read_facts
 from plushsense.deploy.convert import check_format
@@ -41,12 +42,17 @@ _TRIED = 512  # maximum of windows on which a conversion is compared with the ne
 
 
 def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent) -> Bundle:
-    """Return the bundle calibrated on its `training_windows`; a fine-tuned bundle keeps its calibration.
+    """Return the bundle calibrated on its `training_windows`, with the readings of the training people.
+
+    A fine-tuned bundle keeps its calibration.
 
     Raises:
         ArchError, BundleError: as for `training_windows`.
     """
     refuse_undeployable(bundle.arch)
+    dataset, people = as_dataset(dataset).with_inputs(bundle.layout), bundle.provenance.get("subjects")
+    if bundle.readings is None and isinstance(people, list) and dataset.layout.reads_as(bundle.layout):
+        bundle = replace(bundle, readings=Readings.of(dataset, people))
     if bundle.calibration and bundle.provenance.get("quantize_aware"):
         warn(Message("the bundle was fine-tuned for its own calibration, which is kept"))
         return bundle

@@ -16,7 +16,7 @@ from plushsense.core.layouts import Layout
 from plushsense.core.sentences import Message
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.quality.outliers import far_inputs
-from plushsense.dataset.statistics import median_gesture_s
+from plushsense.dataset.statistics import fitting_window_s, median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.deploy.quantize import refuse_undeployable
 from plushsense.evaluation.crossval import fold_windows
@@ -179,7 +179,7 @@ def network_for(config: RunConfig, layout: Layout) -> tuple[str, tuple[int, ...]
 
     With the preset ``people`` and a layout of vectors alone, one of them an acceleration, the default network has a
     vector layer. Beside other sensors it was no better (on the virtual toy; no real recordings were at hand). Kernels
-    of default networks last as long at any rate.
+    of default networks are scaled below 67 and above 150 Hz, so that they last as long.
     """
     padding = config.model.padding or PADDING[config.preset]
     axes = {axis for vector in layout.vectors for axis in vector}
@@ -395,24 +395,27 @@ _LONG_WINDOWS = (
 def warn_of_long_windows(
     dataset: Dataset, arch: Arch, spec: WindowSpec, gestures: GestureSet, warn: Warn = silent
 ) -> None:
-    """Warn if the window, or what the network reads, is longer than half of the recordings of the gestures."""
+    """Warn if the window, or what the kernels read, is longer than half of the recordings of the gestures.
+
+    Whoever follows the advice gets no other one.
+    """
     usual_s = median_gesture_s(dataset, gestures.labels)
-    rate_hz, window_s = dataset.layout.rate_hz, spec.window_s
-    field_s = arch.receptive_field / rate_hz
-    reads_s = max(window_s, arch.span / rate_hz, field_s)
-    if usual_s is None or reads_s <= usual_s:
+    layout, window_s = dataset.layout, spec.window_s
+    field_s = arch.receptive_field / layout.rate_hz
+    if usual_s is None:
         return
-    advice = []
-    fitting = dataset.layout.samples(min(window_s, usual_s))
-    # By default, a decision averages over what the kernels leave of the window; if that is too little, over all of it.
-    if arch.receptive_field > fitting - arch.step:
-        advice.append(f"--arch {symbol_within(arch.symbol, max(1, fitting // 2))}")
-    elif reads_s > window_s:
-        advice.append("a shorter --pool-s")
-    if window_s > usual_s:
-        advice.append(f"window_s = {max(0.5, round(usual_s, 1)):g} in [windows] of a --config file, or in a grid")
+    shorter_s, advice = fitting_window_s(usual_s), []
+    if field_s > usual_s:
+        advice.append(f"--arch {symbol_within(arch.symbol, max(1, layout.samples(min(window_s, usual_s)) // 2))}")
+    if window_s > max(usual_s, shorter_s):
+        then = replace(arch, window=layout.samples(shorter_s), pool=None)
+        still = f" (a decision then reads {then.span / layout.rate_hz:.1f} s)" if then.span > then.window else ""
+        advice.append(f"window_s = {shorter_s:g} in [windows] of a --config file, or in a grid{still}")
+    if not advice:
+        return
     looped = spec.context in ("loop", ROWS)
     template = _LOOPED_WINDOWS if looped else _LONG_WINDOWS
+    reads_s = max(window_s, arch.span / layout.rate_hz, field_s)
     values = {"reads": float(reads_s), "kernels": field_s, "window": window_s, "usual": float(usual_s)}
     warn(Message(template, **values, advice=" and ".join(advice)))
 

@@ -33,6 +33,7 @@ from plushsense.dataset.quality.measurements import Examination, backward_steps,
 from plushsense.dataset.store import Dataset
 from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.studio.app.words import Words
+from plushsense.windows.cut import recordings_in_time
 
 pytestmark = pytest.mark.apart("real-recordings")
 
@@ -299,6 +300,26 @@ def cut(folder: Path) -> str:
     return "P2/fulldatastream"
 
 
+def with_a_level_for_each_gesture(folder: Path) -> str:
+    """Add a level to channel 5 by which the gestures differ before they begin, as sessions of one gesture each do."""
+    for path in (folder / "recordings").rglob("*.csv"):
+        level = 40 * LABELS.index(path.name.split("_")[0])
+        change(path, lambda f, by=level: add_to_channel(f, 5, np.full(len(f), by)))
+    return ""
+
+
+def in_one_session(folder: Path) -> str:
+    """Keep one gesture of one person only, in a session of its own."""
+    (folder / "recordings" / "P2" / "s9").mkdir()
+    for path in sorted((folder / "recordings").rglob("Tail tap 1_*.csv")):
+        if path.parent.name == "P2":
+            path.rename(path.parent / "s9" / path.name)
+        else:
+            path.unlink()
+    (folder / "index.json").unlink(missing_ok=True)
+    return ""
+
+
 EVERY = slice(None)
 HIGHEST = [9999, 9999, 9999, 400, *[20000] * 9]
 standing = at_times(lambda t: t // 10**6 * 10**6)
@@ -318,6 +339,8 @@ PLANTS: list[tuple[str, str, Plant]] = [
     ("spikes", "rows", in_recording(with_values(np.arange(40, 280, 40), 11, 9000))),
     ("garbage", "failed reading", in_recording(with_values(120, 11, 8388607))),
     ("malformed", "line", malformed),
+    ("rest-tells", "levels", with_a_level_for_each_gesture),
+    ("one-session", "gesture", in_one_session),
     ("duplicate", "recording", duplicate),
     ("duplicate", "rows", copied_inside),
     ("overlap", "rows", overlapping),
@@ -438,6 +461,73 @@ def test_a_clock_that_stands_still_is_not_called_too_short(copy: Path) -> None:
     standing(copy)
     assert {f.severity for f in check(open_dataset(copy), only=["clock-still"]).findings} == {"error"}
     assert check(open_dataset(copy), only=["too-short"]).findings == ()
+
+
+def test_a_garbled_stamp_of_the_computer_is_no_pause(copy: Path) -> None:
+    def garbled(frames: Frames) -> Frames:
+        assert frames.host_ms is not None
+        host = frames.host_ms.copy()
+        host[[700, 900]] = 10**18, 7
+        return replace(frames, host_ms=host)
+
+    change(copy / "streams" / "P2" / "fulldatastream.csv", garbled)
+    assert check(open_dataset(copy), only=["resumed"]).findings == ()
+
+
+def with_ten_bits(folder: Path, *, minutes_of_rest: int) -> Path:
+    """Import people of an accelerometer whose noise is below one step: waves, a tilt that is held, and rest.
+
+    The first ``minutes_of_rest`` people have a minute of rest as well.
+    """
+    levels = np.array([512, 512, 620])
+    source = folder / "source"
+    source.mkdir()
+    for person in range(4):
+        rng = np.random.default_rng(person)
+        labels = [("", 150), ("wave", 200), ("", 150), ("tilt", 200), ("", 150), ("rest", 200)] * 4
+        labels += [("", 150), ("rest", 6000)] if person < minutes_of_rest else []
+        lines = ["time_ms,label,x,y,z"]
+        for label, rows in labels:
+            values = levels + rng.normal(0, 0.2, (rows, 3))
+            up = np.clip(np.sin(np.linspace(-0.4, np.pi + 0.4, rows)) * 2, 0, 1)[:, None]
+            if label == "wave":
+                values += 60 * up * np.sin(np.arange(rows) / 5)[:, None] * rng.uniform(0.5, 1, 3)
+            elif label == "tilt":
+                values += up * rng.integers(-200, 200, 3)
+            start = 10 * (len(lines) - 1)
+            lines += [f"{start + 10 * k},{label},{x},{y},{z}" for k, (x, y, z) in enumerate(values.round().astype(int))]
+        (source / f"S{person}.csv").write_text("\n".join(lines) + "\n")
+    pattern = (
+        'paths = ["{subject}.csv"]\n[layout]\nname = "ten"\nrate_hz = 100.0\nvectors = [["x", "y", "z"]]\nchannels = ['
+    )
+    axes = ", ".join(
+        f'{{ name = "{n}", kind = "acceleration", unit = "", valid_min = -2048, valid_max = 2048 }}' for n in "xyz"
+    )
+    (folder / "ten.toml").write_text(f"{pattern}{axes}]\n")
+    return import_recordings(source, folder / "TEN", pattern=folder / "ten.toml").dataset.path
+
+
+def test_a_coarse_sensor_at_rest_or_on_a_plateau_is_not_broken(tmp_path: Path) -> None:
+    folder = with_ten_bits(tmp_path, minutes_of_rest=0)
+    assert [f"{f.check} {f.about}: {f.message}" for f in check(open_dataset(folder)).findings] == []
+    path = next((folder / "recordings" / "S1").rglob("wave_*.csv"))
+    layout = open_dataset(folder).layout
+    frames = read_recording(path, layout).frames
+    values = frames.values.copy()
+    values[:, 1] = 512
+    rewrite(path, format_header(layout) + format_rows(replace(frames, values=values), layout))
+    for index in folder.glob("index.json"):
+        index.unlink()
+    assert [f.check for f in check(open_dataset(folder), only=["flat"]).findings] == ["flat"]
+
+
+def test_a_minute_of_rest_of_everybody_was_not_forgotten(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    one = open_dataset(with_ten_bits(tmp_path / "one", minutes_of_rest=1))
+    assert [f.subject for f in check(one, only=["never-stopped", "duration"]).findings] == ["S0"]
+    every = open_dataset(with_ten_bits(tmp_path, minutes_of_rest=3))
+    assert check(every, only=["never-stopped", "duration"]).findings == ()
+    assert len(recordings_in_time(list(every.recordings))) == len(every.recordings)
 
 
 def test_every_check_has_a_planted_fault() -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from plushsense.evaluation.leakage import LeakageResult
 from plushsense.experiments.baselines.baselines_page import (
     COUNTS,
     LEAKY,
@@ -19,6 +20,7 @@ from plushsense.experiments.baselines.score import BaselinesResult, ProgramGap, 
 
 pytestmark = pytest.mark.apart("models")
 
+AUDIT = LeakageResult(1890, 0, 0, 0, 0, 0, 0, ())
 SPLITS = (("leave-one-subject-out", False), ("windows:5", True))
 
 
@@ -38,7 +40,8 @@ def comparison(*splits: tuple[str, bool], simulated: bool = False) -> BaselinesR
         if len(splits) == 2:
             gaps.append(ProgramGap(*own, splits[0][0], splits[1][0], {"accuracy": at[1] - at[0]}))
     return BaselinesResult(
-        "stream", tuple(SplitFolds(split, leaky, 5) for split, leaky in splits), 1890, 300, 9, ("a", "b"), 0, 10, 0,
+        "stream", tuple(SplitFolds(split, leaky, 5, AUDIT) for split, leaky in splits),
+        1890, 300, 9, ("a", "b"), 0, 10, 0,
         tuple(models), tuple(gaps), "study $1", "0", simulated, "ours", {}, 2.5, "1", "a processor", "1",
     )  # fmt: skip
 
@@ -68,6 +71,7 @@ def test_the_figure_marks_both_splits_and_joins_them() -> None:
 @pytest.mark.parametrize("simulated", [False, True])
 def test_the_page_says_what_counts_and_what_is_simulated(simulated: bool) -> None:
     text = page(comparison(*SPLITS, simulated=simulated))
+    assert "Leakage audit of windows:5" in text
     assert COUNTS in text and "LEAKY" in text and "the tree &lt;b&gt;" in text and "a processor" in text
     assert ("scores are of a simulation" in text) == simulated
     assert LEAKY in page(comparison(SPLITS[1]))

@@ -19,7 +19,7 @@ from plushsense.core.layouts import ACCELERATION, MEASURED, Layout
 from plushsense.core.sentences import join_names
 from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.quality.outliers import find_failed_readings
-from plushsense.dataset.statistics import median_gesture_s
+from plushsense.dataset.statistics import fitting_window_s, median_gesture_s
 from plushsense.dataset.store import Dataset, RecordingInfo
 
 DEFAULT_WINDOW_S = 2.5
@@ -42,6 +42,8 @@ _LEAST_POINTS = 3
 # Sensors are different if their zeros are this share of 1 g apart, or their scales differ by this factor.
 _OTHER_ZERO = 0.5
 _OTHER_SCALE = 1.25
+# Where gravity is subtracted, what a sensor reads at rest is a smaller share of what it reads on average.
+_GRAVITY = 0.3
 # 1 g in units and in steps of usual digital sensors, recognised within 5 % if no other is nearly as close.
 _UNITS = {
     "g": 1.0,
@@ -316,6 +318,18 @@ def _sensors_of(dataset: Dataset, vector: tuple[str, ...]) -> Iterator[Sensor]:
             yield Sensor.of(layout, vector, steps, fit, {sessions[k]: own[k] for k in members.tolist()})
 
 
+def length_at_rest(dataset: Dataset, axes: list[int]) -> float | None:
+    """Return the median length of an acceleration in the stillest blocks, in steps; None if they show no gravity."""
+    _, blocks, _ = _blocks(dataset, axes)
+    if len(blocks) < _LEAST_BLOCKS:
+        return None
+    means = blocks[:, :3] - dataset.layout.zero_int[axes]
+    still = blocks[:, 3] <= np.quantile(blocks[:, 3], _STILLEST)
+    length = float(np.median(np.linalg.norm(means[still], axis=1)))
+    moving = float(np.sqrt((means**2).sum(axis=1).mean() + 3 * (blocks[:, 3] ** 2).mean()))
+    return length if length > max(_GRAVITY * moving, 3 * float(np.median(blocks[still, 3]))) else None
+
+
 def _errors(fit: Sphere, points: Floats, owner: NDArray[np.int64], sessions: int) -> Floats:
     """Return the median distance of each session's points from a sphere as a share of its radius (inf: no points)."""
     centre, radius = fit
@@ -450,7 +464,7 @@ def _window(dataset: Dataset) -> Iterator[Proposal]:
     if seconds is not None and seconds < DEFAULT_WINDOW_S:
         yield Proposal(
             "window_s",
-            max(0.5, round(seconds, 1)),
+            fitting_window_s(seconds),
             f"half of the recordings last less than {seconds:.1f} s, so windows of {DEFAULT_WINDOW_S} s, the default, "
             "mostly begin before their gesture",
             proven=False,

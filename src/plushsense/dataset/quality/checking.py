@@ -51,6 +51,7 @@ _OVERTAKEN = "check the radio; readers leave out a single such row, and restart 
 _RESTART = "nothing: readers restart there"
 _DIGITS = "import it again, with all digits of its times or with row_rate_hz in a pattern"
 _LEFT_OUT = "nothing: that line is left out"
+_MIXED = "record each gesture in several sessions, and several gestures in each"
 
 CHECKS: dict[str, Check] = {
     "never-stopped": Check(recordings.never_stopped, (_R,), "error", "trim it to the gesture, or exclude it", True),
@@ -87,6 +88,8 @@ CHECKS: dict[str, Check] = {
     "not-in-stream": Check(comparisons.not_in_stream, (_R,), "warning", "check that the stream is this session's"),
     "missing": Check(comparisons.missing, (_P,), "warning", "record it if the person is still there, or accept"),
     "label": Check(comparisons.unknown_label, (_D,), "warning", "give a gesture set that has it, or rename the files"),
+    "rest-tells": Check(comparisons.rest_tells, (_D,), "warning", _MIXED),
+    "one-session": Check(comparisons.one_session, (_D,), "warning", _MIXED),
     "class-balance": Check(comparisons.class_balance, (_D,), "info", "weight the classes, or leave odd ones out"),
     "subject-balance": Check(comparisons.subject_balance, (_D,), "info", "weight the people, or record more"),
 }
@@ -192,7 +195,7 @@ def check(
     checks = known_checks(only)
     limits = limits or CheckLimits()
     used = dataset.used
-    usual = usual_rows((r.gesture, r.stop - r.start) for r in used)
+    usual = usual_rows((r.gesture, r.subject, r.stop - r.start) for r in used)
     findings: list[Finding] = []
     summaries: list[RecordingSummary] = []
     streams: list[RecordingSummary] = []
@@ -319,15 +322,20 @@ def author_name(who: str | None) -> str:
 
 
 def exclusions(
-    dataset: Dataset, exclude: Sequence[str] = (), include: Sequence[str] = (), *, who: str, why: str
+    dataset: Dataset, exclude: Sequence[str], include: Sequence[str], findings: Sequence[Finding], *, who: str, why: str
 ) -> list[Mark]:
-    """Return marks for the recordings to exclude or include, given as ids or patterns."""
-    return [
-        Mark(identity, action, who, why)
-        for action, patterns in (("exclude", exclude), ("include", include))
-        for pattern in patterns
-        for identity in match_ids(pattern, [r.id for r in dataset.recordings], "recording")
-    ]
+    """Return marks for the recordings to exclude or include, given as ids or patterns.
+
+    ``CHECK:PATTERN`` in ``exclude`` means those of which ``findings`` has one of the check that is not accepted.
+    """
+    known = [r.id for r in dataset.recordings]
+    marks = []
+    for entry in exclude:
+        check, pattern = parse_acceptance(entry) if ":" in entry else ("", entry)
+        found = [f.recording for f in findings if f.check == check and f.recording and not f.accepted]
+        kind = f"recording with a finding of '{check}'" if check else "recording"
+        marks += [Mark(i, "exclude", who, why) for i in match_ids(pattern or "*", found if check else known, kind)]
+    return marks + [Mark(i, "include", who, why) for entry in include for i in match_ids(entry, known, "recording")]
 
 
 def parse_acceptance(text: str) -> tuple[str, str]:

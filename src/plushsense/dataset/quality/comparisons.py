@@ -16,6 +16,7 @@ from plushsense.dataset.quality.findings import PARTLY_THERE, Issue
 from plushsense.dataset.quality.measurements import (
     LEVEL_KINDS,
     NEVER_STOPPED_FACTOR,
+    START_HOPS,
     DatasetSummary,
     RecordingSummary,
     gesture_of,
@@ -40,6 +41,9 @@ _OFTEN = 0.04
 _OVERLAP = 0.1
 _MADE_BY = 0.9
 _AGREE = 0.6
+# The rest before the gestures tells them if it names this share of them right, and so much more than guessing.
+_TELLING, _BEYOND_GUESSING = 0.5, 0.25
+_RESTS = 20
 
 
 def usual_seconds(durations: Sequence[float]) -> float:
@@ -122,7 +126,8 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
 def flat(w: DatasetSummary) -> Iterator[Issue]:
     """Find channels that never change in a recording or stream; those constant in most recordings, once for all.
 
-    A binary or counting channel is reported only if it is constant in every recording and stream.
+    A binary or counting channel is reported only if it is constant in every recording and stream, and a coarse one not
+    where it hardly moves in the other recordings of the gesture either.
     """
     names = w.dataset.layout.names
     discrete = np.array([ch.is_discrete for ch in w.dataset.layout.channels])
@@ -139,7 +144,8 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
             severity="warning",
         )
     for o in (*long, *(s for s in w.streams if s.rows >= _FLAT_ROWS)):
-        dead = np.flatnonzero((o.runs >= o.rows) & ~always & ~discrete & ~(w.zeroed & (o.zeros == o.rows)))
+        known = always | discrete | w.still(o) | (w.zeroed & (o.zeros == o.rows))
+        dead = np.flatnonzero((o.runs >= o.rows) & ~known)
         if len(dead):
             stream = isinstance(o.info, StreamInfo)
             subject = f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'}"
@@ -189,12 +195,16 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
     if not w.recordings:
         return
     names = w.dataset.layout.names
+    longest = np.percentile([o.runs * o.period_ms for o in w.recordings], 90, axis=0)
     limit = np.maximum(w.limits.stuck_s * 1000, 10 * w.usual_run_ms)
+    # At rest between gestures, one value for a while is usual for a coarse sensor.
+    limit = np.where(w.coarse, np.maximum(limit, 2 * longest), limit)
     discrete = np.array([ch.is_discrete for ch in w.dataset.layout.channels])
     for o, least in [(o, limit) for o in w.recordings] + [(o, 4 * limit) for o in w.streams]:
         run_ms = o.runs * o.period_ms
         # The check `zeroed` reports an axis that stays at 0 because low values were replaced.
-        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows) & ~discrete & ~(w.zeroed & (o.zeros >= o.runs)))
+        known = discrete | w.still(o) | (w.zeroed & (o.zeros >= o.runs))
+        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows) & ~known)
         if not len(affected):
             continue
         c = int(affected[np.argmax(run_ms[affected])])
@@ -237,7 +247,8 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
     for o in w.recordings:
         at_rail = shared & (np.abs(o.top) >= _RAIL * rail)
         run_ms = o.top_runs * o.period_ms
-        long = np.where(at_rail, run_ms >= most / 2, run_ms >= most) & (o.top_runs >= 3)
+        # On a plateau, a coarse sensor stays at one value without being at its limit.
+        long = np.where(at_rail, run_ms >= most / 2, (run_ms >= most) & ~w.coarse) & (o.top_runs >= 3)
         often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
         moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
         affected = np.flatnonzero((long | often) & moving & ranged & (o.top >= least) & ~(w.zeroed & (o.top == 0)))
@@ -535,6 +546,61 @@ def class_balance(w: DatasetSummary) -> Iterator[Issue]:
         elif not w.dataset.gestures.inferred:
             counts.setdefault(gesture.label, 0)
     yield from _balance(counts, "gestures", w.limits.balance)
+
+
+def one_session(w: DatasetSummary) -> Iterator[Issue]:
+    """Find gestures whose recordings are all of one session that has no other gesture.
+
+    Whatever else is special in that session, such as a baseline, then stands for the gesture.
+    """
+    sessions: dict[str, set[tuple[str, str]]] = {}
+    for o in w.recordings:
+        sessions.setdefault(gesture_of(o), set()).add((o.info.subject, o.info.session))
+    apart = {g.label for g in w.dataset.gestures.gestures if g.nobody or g.free_choice}
+    for gesture, own in sorted(sessions.items()):
+        if gesture in apart:
+            continue
+        others = set().union(*(s for g, s in sessions.items() if g != gesture))
+        if len(own) == 1 and others and not own & others:
+            ((subject, session),) = own
+            template = "every recording of '{gesture}' is of one session ({session}), which has no other gesture"
+            yield Issue(Message(template, gesture=gesture, session=f"{subject}/{session}".strip("/")))
+
+
+def rest_tells(w: DatasetSummary) -> Iterator[Issue]:
+    """Report whether the rest before the touch already tells the gesture: a control that should only guess.
+
+    Each recording that begins at rest gets the gesture of the one with the most similar mean of its first 0.3 s, among
+    those of other people, or of all if only one person has such recordings.
+    """
+    rests = []
+    for o in w.recordings:
+        activity = w.activity(o)
+        peak = float(np.percentile(activity, 95)) if len(activity) else 0.0
+        if peak >= _SOMETHING and activity[:START_HOPS].max() < _QUIET * peak:
+            rests.append(o)
+    gesture, subject = np.array([gesture_of(o) for o in rests]), np.array([o.info.subject for o in rests])
+    if len(rests) < _RESTS or len(set(gesture.tolist())) < 2:
+        return
+    start = np.array([o.start for o in rests])
+    start /= np.maximum(start.std(axis=0), 1e-9)
+    apart = subject[:, None] != subject if len(set(subject.tolist())) > 1 else ~np.eye(len(rests), dtype=bool)
+    right = [
+        gesture[others][np.square(start[others] - x).sum(axis=1).argmin()] == own
+        for x, own, others in zip(start, gesture, apart, strict=True)
+        if others.any()
+    ]
+    share, guess = float(np.mean(right)), max(Counter(gesture.tolist()).values()) / len(rests)
+    if share >= _TELLING and share >= guess + _BEYOND_GUESSING:
+        yield Issue(
+            Message(
+                "the rest before the touch, its first 0.3 s alone, tells {percent:.0f} % of {n} gestures (guessing "
+                "{guess:.0f} %), so scores show how sessions differ rather than touches",
+                percent=100 * share,
+                n=len(right),
+                guess=100 * guess,
+            )
+        )
 
 
 def subject_balance(w: DatasetSummary) -> Iterator[Issue]:

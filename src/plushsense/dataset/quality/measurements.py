@@ -202,20 +202,33 @@ class Examination:
         return int(at) + self.first_row + 1
 
 
-def usual_rows(recordings: Iterable[tuple[str, int]]) -> dict[str, float]:
-    """Return the median number of rows of each gesture, from pairs of gesture and rows."""
-    rows: dict[str, list[int]] = {}
-    for gesture, n in recordings:
-        rows.setdefault(gesture, []).append(n)
-    return {gesture: float(np.median(ns)) for gesture, ns in rows.items()}
+def usual_rows(recordings: Iterable[tuple[str, str, int]]) -> dict[str, float]:
+    """Return the usual number of rows of each gesture, from triples of gesture, person and rows: their median.
+
+    If over half of at least three people have one beyond `NEVER_STOPPED_FACTOR` times that, as where each also has a
+    minute of rest, it is the median of the people's longest: nobody forgot to stop.
+    """
+    rows: dict[str, dict[str, list[int]]] = {}
+    for gesture, person, n in recordings:
+        rows.setdefault(gesture, {}).setdefault(person, []).append(n)
+    usual = {}
+    for gesture, people in rows.items():
+        median = float(np.median([n for own in people.values() for n in own]))
+        longest = [max(own) for own in people.values()]
+        long = sum(n > NEVER_STOPPED_FACTOR * median for n in longest)
+        usual[gesture] = float(np.median(longest)) if len(longest) >= 3 and 2 * long > len(longest) else median
+    return usual
 
 
 LEVEL_KINDS = ("capacitive", "proximity")
 """Kinds of channels whose level shows touch; the level of other kinds also changes as the toy is turned."""
 NEAR_ZERO = 10
 _HOP_S = 0.1
+START_HOPS = 3
+"""Blocks of 0.1 s at the beginning of a recording, of which a summary keeps the mean."""
 _CHUNK_S = 10.0
 _NOISE = 2.0
+_FEW_STEPS = 4.0
 # Least scale of a channel's activity, as a multiple of its noise, so that channels that never move do not count.
 _MOVED = 10.0
 
@@ -230,8 +243,8 @@ class RecordingSummary:
     ``top_at`` are the same at the highest or lowest value ``top``, which occurs in ``top_rows`` rows. ``spread`` (C,)
     is the range from the 2nd to the 98th percentile, ``lowest`` and ``highest`` the extremes, ``zeros`` counts the rows
     that are 0 and ``near_zeros`` those from 1 to `NEAR_ZERO` steps beside it, ``low`` the 10th percentile, ``lows`` (K,
-    C) the 10th percentile of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream, and
-    ``hashed`` has one of each row, None for a stream.
+    C) the 10th percentile of every 10 s of a stream, ``start`` (C,) the mean of the first 0.3 s. ``content`` is a
+    hash of the values, b"" for a stream, and ``hashed`` has one of each row, None for a stream.
     """
 
     info: RecordingInfo | StreamInfo
@@ -252,6 +265,7 @@ class RecordingSummary:
     highest: NDArray[np.int64]
     zeros: NDArray[np.int64]
     near_zeros: NDArray[np.int64]
+    start: NDArray[np.float64]
     content: bytes
     lows: NDArray[np.float64] | None = None
     hashed: HashedRows | None = None
@@ -329,6 +343,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
         values.max(axis=0),
         zeros := (values == 0).sum(axis=0),
         (np.abs(values) <= NEAR_ZERO).sum(axis=0) - zeros,
+        values[: START_HOPS * hop].mean(axis=0),
         # Hash the values only, since copies may have other names and clocks.
         b"" if stream else hashlib.sha256(np.ascontiguousarray(frames.values).tobytes()).digest(),
         lows,
@@ -411,6 +426,23 @@ class DatasetSummary:
     def usual_run_ms(self) -> NDArray[np.float64]:
         """Usual duration of each channel's longest run of one value in ms, (C,): the median over the recordings."""
         return np.asarray(np.median([o.runs * o.period_ms for o in self.recordings], axis=0))
+
+    @cached_property
+    def coarse(self) -> NDArray[np.bool_]:
+        """Channels (C,) whose noise at rest is mostly below one step, so that one value for a while means nothing."""
+        quiet = [np.percentile(o.activity, 10, axis=0) for o in self.recordings if len(o.activity)]
+        return np.asarray(np.median(quiet or np.ones((1, self.dataset.layout.n_channels)), axis=0) == 0)
+
+    @cached_property
+    def _still(self) -> dict[str, NDArray[np.bool_]]:
+        spreads: dict[str, list[NDArray[np.float64]]] = {}
+        for o in self.recordings:
+            spreads.setdefault(gesture_of(o), []).append(o.spread)
+        return {gesture: self.coarse & (np.median(group, axis=0) <= _FEW_STEPS) for gesture, group in spreads.items()}
+
+    def still(self, o: RecordingSummary) -> NDArray[np.bool_]:
+        """Return the `coarse` channels (C,) that hardly move in the gesture of a recording; for a stream, none."""
+        return self._still.get(gesture_of(o), np.zeros(self.dataset.layout.n_channels, dtype=bool))
 
     @cached_property
     def usual_top_ms(self) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from plushsense.core.row_times import bridged_ms, stray_rows
 from plushsense.core.sentences import Message
 from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
 from plushsense.dataset.quality.measurements import (
@@ -295,6 +296,8 @@ def resumed(s: Examination) -> Iterator[Issue]:
     host = s.frames.host_ms
     if host is None or s.frames.device_ms is host:
         return
+    # A stamp that the next one does not follow was garbled.
+    host = bridged_ms(host, stray_rows(host, s.limits.pause_s * 1000))
     quiet = np.diff(host) - np.where(s.steps <= s.limits.pause_s * 1000, np.maximum(s.steps, 0), 0)
     at = np.flatnonzero(quiet > s.limits.pause_s * 1000)
     if not len(at):

@@ -15,7 +15,7 @@ from plushsense.experiments.baselines.score import (
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
 from plushsense.reports.table import Column, Table, count, mean_sd, number
-from plushsense.reports.wording import CONTEXT_SHORT
+from plushsense.reports.wording import CONTEXT_SHORT, describe_leakage
 from plushsense.scoring.metrics import column_metrics
 
 if TYPE_CHECKING:
@@ -182,6 +182,7 @@ def page(result: BaselinesResult) -> str:
         about=describe_data(result),
         table=program_table(result),
         metrics=column_metrics(),
+        audits={s.split: describe_leakage(s.leakage.to_json()) for s in result.splits},
         counts=COUNTS if result.gaps else LEAKY,
         any_leaky=any(s.leaky for s in result.splits),
         costs=describe_costs(result),

@@ -8,6 +8,7 @@ import platform
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.version import __version__
 from plushsense.dataset.index import as_dataset
+from plushsense.dataset.quality.copies import copied_recordings
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.leakage import warn_of_copies
 from plushsense.experiments.baselines.models import (
     BASELINES,
     DEFAULT_FEATURES,
@@ -251,8 +254,12 @@ def baselines(
         spec.splits,
         spec=JobsSpec(run.evaluation.processes, journal=journal_of(dataset, "baselines"), cluster=cluster),
         seed=run.evaluation.seed,
+        shared_rows=partial(copied_recordings, dataset, windows.recording_ids),
         progress=progress,
     )
+    for split in compared.splits:
+        if not split.leaky:
+            warn_of_copies(split.leakage, warn)
     result = BaselinesResult(
         **vars(compared),
         dataset=dataset.head.name,

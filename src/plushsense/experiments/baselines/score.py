@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, need
 from plushsense.core.gestures import NOBODY
-from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
+from plushsense.evaluation.crossval import SharedRows, context_of, fold_fingerprint, fold_windows, windows_fingerprint
+from plushsense.evaluation.leakage import LeakageResult, audit_leakage
 from plushsense.evaluation.scores import FoldRecord, compute_scores, gather_predictions
 from plushsense.jobs.journal import Result
 from plushsense.jobs.pool import JobsSpec, Report
@@ -139,11 +140,12 @@ class ProgramGap:
 
 @dataclass(frozen=True)
 class SplitFolds:
-    """A split of the comparison, and its number of folds."""
+    """A split of the comparison, its number of folds, and what its folds share (see `audit_leakage`)."""
 
     split: str
     leaky: bool
     folds: int
+    leakage: LeakageResult
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,7 @@ class ComparisonResult:
     def to_json(self) -> dict[str, object]:
         """Return plain values; the metrics of a row stand beside its other keys."""
         rows = {
-            "splits": [dict(vars(split)) for split in self.splits],
+            "splits": [{**vars(split), "leakage": split.leakage.to_json()} for split in self.splits],
             "labels": list(self.labels),
             "models": [flat(row) for row in self.models],
             "gaps": [flat(gap) for gap in self.gaps],
@@ -210,11 +212,15 @@ def compare(
     *,
     spec: JobsSpec | None = None,
     seed: int = 0,
+    shared_rows: SharedRows = tuple,
     progress: Progress | None = None,
 ) -> ComparisonResult:
     """Fit and score every contender in every fold of every split, all on the same windows.
 
     Programs are fitted to the training windows of a fold; its validation windows are for early stopping only.
+
+    Args:
+        shared_rows: called for the argument ``shared_rows`` of `audit_leakage`.
 
     Raises:
         ConfigError: for a contender or split that is given twice, an unknown split, or none of either.
@@ -243,9 +249,13 @@ def compare(
     def summarise(study: StudyResults) -> ComparisonResult:
         together = itertools.groupby(study.done, key=lambda done: (done[0].task.contender, done[0].task.split))
         rows = tuple(_row(windows, list(done)) for _, done in together)
+        shared = shared_rows()
         return ComparisonResult(
             context_of(windows),
-            tuple(SplitFolds(split.text, split.leaky, len(made)) for split, made in folds.items()),
+            tuple(
+                SplitFolds(split.text, split.leaky, len(made), audit_leakage(windows, windows, made, shared))
+                for split, made in folds.items()
+            ),
             len(windows),
             len(np.unique(windows.recording)),
             len(set(windows.subject.tolist()) - {NOBODY}),

@@ -1,5 +1,5 @@
 /*
- * A toy in three tasks, for ESP-IDF 5.2 to 5.x with FreeRTOS and the Bluetooth stack NimBLE:
+ * A toy in three tasks, for ESP-IDF 5.2 and newer with FreeRTOS and the Bluetooth stack NimBLE:
  *
  *     sample   takes a reading when it is due, whatever the others do, and puts it into a queue
  *     feel     gives the readings to the library, on a core of its own where there are two: the only one that touches it
