@@ -55,6 +55,17 @@ def test_a_tested_recording_is_protected_even_where_it_was_scored_looped() -> No
         assert touched(stream, fold.train, stream, np.array(where)) == 0
 
 
+def test_what_is_not_scored_is_trained_on_in_every_fold_unless_people_are_left_out() -> None:
+    # Such as the idle parts of a stream, which count as one recording: without them, nothing would be idle.
+    train = study(nobody=0, context="loop")
+    score = train.take(np.flatnonzero(train.recording % 4))
+    unscored = set(np.flatnonzero(train.recording % 4 == 0).tolist())
+    for fold in fold_windows(train, score, parse_split("by-recording:4")):
+        assert unscored <= set(fold.train.tolist())
+    apart = [set(fold.train.tolist()) for fold in fold_windows(train, score, parse_split("leave-one-subject-out"))]
+    assert not any(unscored <= each for each in apart)
+
+
 def test_whole_people_lose_no_window() -> None:
     windows = study(nobody=0)
     for fold in fold_windows(windows, windows, parse_split("leave-one-subject-out")):

@@ -48,6 +48,7 @@ def test_a_person_is_forgotten_everywhere_and_comes_back_by_no_single_click(
     assert traces.get_by_role("checkbox", checked=True).count() == 4
     listed = traces.inner_text()
     assert [text in listed for text in ("Datu kopa", "„little”", "P02: ierakst", ".zip”")] == [True] * 4, listed
+    assert marked(page, "forget-backup").get_by_text("kas nav atzīmēta, šis cilvēks paliek").count() == 1
     assert axe(page) == []
     for kept in ("ierakstītās sesijas", "Rezerves kopija"):
         traces.get_by_role("checkbox", name=kept).click()

@@ -10,7 +10,7 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.marks import Mark, read_marks
+from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.privacy.forget import take_out
 from plushsense.dataset.store import read_people
 from plushsense.studio.app.workspace import Workspace
@@ -62,7 +62,20 @@ def test_where_a_session_goes_is_asked_shown_and_undone(studio: Fixture, look: F
     marked(page, "new-name").wait_for(state="hidden")
     collected(page, "S01/1", "virtual toy")
     assert len(open_dataset(trial).recordings) == len(before) + 4
-    undone(page)
+    # What was decided about the recordings since is not dropped without a question.
+    mine = next(r.id for r in open_dataset(trial).recordings if r.subject == "S01")
+    append_marks(trial, [Mark(mine, "trim", "A", "", start=3, stop=90)])
+    marked(page, "selection").get_by_role("button", name="Undo").click()
+    question = marked(page, "ask")
+    question.get_by_text("1 recording is trimmed, left out or decided otherwise since").wait_for()
+    assert axe(page) == []
+    question.get_by_role("button", name="Cancel").click()
+    question.wait_for(state="hidden")
+    assert read_marks(trial)[mine].trimmed
+    marked(page, "selection").get_by_role("button", name="Undo").click()
+    marked(page, "ask-go").click()
+    page.wait_for_url("**/record?ended=S01/1")
+    connected(page)
     assert sorted(r.id for r in open_dataset(trial).recordings) == before
     assert marked(page, "destination").input_value() == "virtual toy", "the last choice"
     choose(page, "destination", "a new data set")

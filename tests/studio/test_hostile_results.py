@@ -36,7 +36,12 @@ SCORED: dict[str, Any] = {
         "parameters": 6650,
         "macs_per_step": 9,
     },
-    "config": {"preset": "people", "training": {"epochs": 60}},
+    "config": {
+        "preset": "people",
+        "training": {"epochs": 60},
+        "windows": {"context": "stream"},
+        "evaluation": {"train_context": None},
+    },
     "dataset": {"name": "DS", "hash": "ab12"},
     "simulated": True,
     "over": "subjects",

@@ -198,7 +198,8 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, hom
     process, address = toy()
     browser = look()
     page = started(browser, studio("--device", address, home=home).url)
-    assert not marked(page, "simulation").is_visible(), "nobody said that this port is a virtual toy"
+    mark = marked(page, "simulation").inner_text()
+    assert "this network was trained on virtual people" in mark, "nobody said that this port is a virtual toy"
     process.kill()
     process.wait(20.0)
     situation(page, "gone")
@@ -337,9 +338,9 @@ def test_the_network_is_adapted_to_recordings_of_the_person(studio: Fixture, loo
     message.get_by_text("The network little is in use again.").wait_for()
     assert ps.load(home / "bundles" / "little-for-S08.plush").adapted_to == "S08"
     assert little.read_bytes() == before
-    # The network of S08 is the newest, but Home goes on with the one for everybody.
-    other = browser.open(page.url.partition("/live")[0])
-    marked(other, "next-sentence").get_by_text("The network “little” is trained").wait_for()
+    # The network of S08 is the newest, but the one for everybody is recommended.
+    other = browser.open(page.url.partition("/live")[0] + "/export")
+    assert "little-for-S08" not in other.locator('[data-test="bundle"] input').input_value() != ""
     marked(page, "start").click()
     situation(page, *READING)
     assert browser.complaints == []

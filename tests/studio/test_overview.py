@@ -135,6 +135,7 @@ GUESSING = replace(PROVEN, interval=(0.1, 0.9))
 LEAKY = replace(PROVEN, leaky=True)
 NET = BundleEntry(Path("m.plush"), "m", score=PROVEN)
 GUESS = BundleEntry(Path("g.plush"), "g", score=GUESSING)
+UNTESTED = BundleEntry(Path("u.plush"), "u", score=replace(PROVEN, kind="training", accuracy=None, interval=None))
 TOY_NET = BundleEntry(Path("v.plush"), "v", simulated=True, score=PROVEN)
 BROKEN_NET = BundleEntry(Path("b.plush"), "b", refused="It is broken.")
 OPEN = SessionEntry(Path("s"), "S01", "1")
@@ -159,6 +160,7 @@ KEPT = SessionEntry(Path("s"), "S01", "1", recordings=4, finished=True, datasets
         (WorkspaceSummary(datasets=(ALONE, MANY)), "", "train", "train"),
         (WorkspaceSummary(datasets=(TRIED,)), "", "train", "train"),
         (WorkspaceSummary(datasets=(TRIED,), bundles=(TOY_NET,)), "", "live", "live"),
+        (WorkspaceSummary(datasets=(TRIED,), bundles=(GUESS, UNTESTED)), "", "test", "live"),
         (WorkspaceSummary(datasets=(TRIED, REAL), bundles=(TOY_NET,)), "", "review", "review"),
         (WorkspaceSummary(datasets=(REAL,), bundles=(NET,)), "", "live", "live"),
         (WorkspaceSummary(bundles=(NET,)), "", "live", "live"),

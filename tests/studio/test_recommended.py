@@ -40,7 +40,12 @@ def evaluated(home: Path, accuracy: float) -> Path:
     network = {key: getattr(arch, key) for key in ("symbol", "padding", "norm", "parameters", "macs_per_step")}
     table |= {
         "model": {**network, "filters": list(arch.filters)},
-        "config": {"preset": origin["preset"], "training": origin["training"]},
+        "config": {
+            "preset": origin["preset"],
+            "training": origin["training"],
+            "windows": {"context": "stream"},
+            "evaluation": {"train_context": "anywhere"},
+        },
         "dataset": {"name": "virtual toy", "hash": origin["dataset_hash"]},
         "simulated": True,
         "over": "subjects",
@@ -67,7 +72,11 @@ def test_a_network_has_the_score_of_its_evaluation(home: Path) -> None:
     assert results.details(after).by_gesture == results.details(proof).by_gesture
     # An evaluation of other settings, or of other data, says nothing about it.
     table = json.loads((folder / SCORES).read_text(encoding="utf-8"))
-    for change in ({"train_context": "loop"}, {"dataset": {"name": "virtual toy", "hash": "ab"}}, {"leaky": True}):
+    # Without streams, it has the context "loop", though "anywhere" was asked for, as for the network.
+    (folder / SCORES).write_text(json.dumps(table | {"train_context": "loop", "context": "loop"}), encoding="utf-8")
+    assert results.networks()[little].proof == folder
+    other = {**table["config"], "evaluation": {"train_context": "loop"}}
+    for change in ({"config": other}, {"dataset": {"name": "virtual toy", "hash": "ab"}}, {"leaky": True}):
         (folder / SCORES).write_text(json.dumps(table | change), encoding="utf-8")
         assert results.networks()[little] == before
     # Somebody's own network is not recommended: it serves one person, and nothing was tested on others.
@@ -76,6 +85,29 @@ def test_a_network_has_the_score_of_its_evaluation(home: Path) -> None:
     networks = results.networks()
     assert list(networks) == [personal, little] and recommended(networks) == str(little)
     assert networks[personal].accuracy is None and networks[personal].proof is None
+
+
+def test_a_network_that_nobody_tested_is_tried_by_one_click(studio: Fixture, look: Fixture, home: Path) -> None:
+    little = home / "bundles" / "little.plush"
+    bundle = Bundle.load(little)
+    untested = {key: value for key, value in bundle.provenance.items() if key != "scores"}
+    replace(bundle, provenance=untested).save(home / "bundles" / "stopped.plush")
+    assert recommended(StoredResults(Workspace(home)).networks(), to_try=True) == str(little), "there is a tested one"
+    little.unlink()
+    here = studio(home=home)
+    browser = look()
+    page = browser.open(here.url)
+    marked(page, "next-sentence").get_by_text("Nobody has tested the network “stopped” yet").wait_for()
+    page.goto(f"{here.url}/export")
+    connected(page)
+    assert marked(page, "none-chosen").is_visible(), "a toy gets no network that may be guessing"
+    page.goto(f"{here.url}/live")
+    connected(page)
+    assert page.locator('[data-test="bundle"] input').input_value() == "stopped"
+    assert "Nobody has tested this network, so it may be guessing." in marked(page, "score").inner_text()
+    marked(page, "start").click()
+    marked(page, "stop").wait_for()
+    assert browser.complaints == []
 
 
 def test_no_page_recommends_a_guess(studio: Fixture, look: Fixture, home: Path) -> None:

@@ -25,11 +25,13 @@ from plushsense.studio.app.stored_results import (
     counted,
     figure,
     score_interval,
+    trial_settings,
 )
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.train.result_details import confusion_table, worst_table
 from plushsense.studio.widgets.verdict import figures, headline, limits, of_ten, people_table
+from plushsense.workflow.config import from_settings
 from support.sweeping import keys
 
 pytestmark = [pytest.mark.apart("train-scores"), pytest.mark.early]
@@ -132,6 +134,8 @@ def test_every_network_whose_predictions_a_sweep_kept_leads_to_its_recordings(
     rows = [row for row in results.rows() if row.kind == TRIAL and row.path == out]
     assert len(rows) == 2
     for row in rows:
+        config = from_settings(**trial_settings(row))
+        assert (config.model.arch, config.model.filters, config.training.epochs) == (row.network[0], (2,), 1)
         details = results.details(row)
         assert details.clickable and details.by_gesture is not None
         counts = np.array(details.by_gesture.counts)
@@ -159,7 +163,8 @@ def test_a_verdict_names_its_limits(home: Path) -> None:
     )
     leaky = replace(row, split="windows:5", leaky=True)
     assert "this test is too easy" in headline(w, leaky) and limits(w, leaky) == []
-    assert headline(w, replace(row, accuracy=None)) == "This result has no score."
+    assert headline(w, replace(row, accuracy=None)).startswith("Nobody has tested this network")
+    assert headline(w, replace(row, accuracy=None, kind=TRIAL)) == "This result has no score."
     tested = replace(row, kind=EVALUATION, split="by-subject:5", spread="subjects", units=25, interval=(0.38, 0.46))
     proof = replace(tested, proof=home / "evaluation")
     gain = {"more": 2, "gain": 0.031, "ci95": [0.012, 0.05]}

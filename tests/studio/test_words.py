@@ -14,11 +14,13 @@ import pytest
 from babel.messages.pofile import read_po
 
 from plushsense.core import errors
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import BadInput, ConfigError, DeviceError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import layout_names, load_layout
 from plushsense.core.sentences import Message
 from plushsense.dataset.quality.checking import CHECKS
+from plushsense.live.adaptation import PersonalSpec, _require_gestures
+from plushsense.studio.app.stored_results import duration_text
 from plushsense.studio.app.words import LANGUAGES, Words, in_context
 from plushsense.studio.pages.live.feed import VIEW_TEXTS
 
@@ -183,6 +185,34 @@ def test_a_note_is_in_the_language_of_the_page_also_after_json() -> None:
     assert Words("lv").sentence("something") == "(Angliski:) something"
     older = {"message": "a.txt is left out", "template": "{file}: {note}", "values": {}}
     assert Words("lv").sentence(older) == "(Angliski:) a.txt is left out"
+
+
+def test_personalising_names_the_gestures_that_had_too_few_recordings() -> None:
+    labels = ("Tail tap 1", "Tail hit 1", "Back stroke 1", "At rest")
+    with pytest.raises(BadInput, match=r"there are 1\. Record more of: Tail hit 1, Back stroke 1, At rest\.$") as error:
+        _require_gestures(labels[:1], labels, "S01", PersonalSpec())
+    assert (
+        Words("lv")
+        .error(error.value)
+        .endswith("Ierakstiet vēl: Uzsitiens pie astes 1, Muguras glāstīšana 1, Miera stāvoklī.")
+    )
+
+
+def test_a_duration_is_rounded_to_the_nearest_minute() -> None:
+    assert [duration_text(Words("en"), s) for s in (59, 258, 330)] == ["under a minute", "about 4 min", "about 6 min"]
+
+
+def test_a_toy_has_a_name_in_place_of_its_address() -> None:
+    gone = DeviceError(
+        "'{url}' went away ({reason}): was it unplugged or switched off?", url="serial:///dev/x", reason=""
+    )
+    used = ConfigError("{toy} is in use: the page Live reads it.", toy="virtual://?person=7")
+    for language, cable, virtual in (
+        ("en", "Toy on the cable x", "Virtual toy (simulation), person 7"),
+        ("lv", "Rotaļlieta pie kabeļa x", "Virtuāla rotaļlieta (simulācija), 7. cilvēks"),
+    ):
+        assert cable in Words(language).error(gone) and "://" not in Words(language).error(gone)
+        assert Words(language).error(used).startswith(virtual)
 
 
 def test_values_have_the_form_of_the_language() -> None:

@@ -244,10 +244,12 @@ def test_no_byte_of_the_person_is_left_that_is_not_listed(
     kinds = ["dataset", "dataset", "network", "backup", "key", "folder", "folder", "notes", "notes"]
     assert [trace.kind for trace in found.traces] == kinds
     assert people_of_home(copied) == sorted({"P1", "P3", "P4", "P5", PERSON, *open_dataset(copied / "copy").subjects})
+    by_command = Path(shutil.copytree(copied, home.with_name("command")))
     receipt = forget_everywhere(copied, PERSON, [trace.id for trace in found.traces])
     assert receipt.removed == found.traces and (receipt.kept, receipt.failed) == ((), ())
     left = {copied / where for where in bytes_of(copied)}
     assert left == set(receipt.found.mentions) and PERSON in json.dumps(receipt.to_json())
+    check_command(cli, by_command, kinds, bytes_of(copied))
     assert len(open_dataset(copied / "copy").subjects) == 4 and found.pseudonyms
     assert PERSON in RemovedCodes.read(copied) and not find_traces(copied, PERSON).traces
     done = cli("forget", dataset, PERSON, "--yes", "--json").json
@@ -262,6 +264,22 @@ def test_no_byte_of_the_person_is_left_that_is_not_listed(
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     assert bytes_of(home) == []
     assert open_dataset(dataset).subjects == ["P1", "P3", "P4", "P5"]
+
+
+def check_command(cli: Cli, home: Path, kinds: list[str], left: list[str]) -> None:
+    """Forget by ``plushsense forget HOME PERSON --everywhere``, which leaves the same as the studio."""
+    before = bytes_of(home)
+    forget_them: tuple[Any, ...] = ("forget", home, PERSON, "--everywhere", "--json")
+    planned = cli(*forget_them, "--dry-run")
+    assert (planned.status, planned.json["done"]) == (0, False) and bytes_of(home) == before
+    assert [trace["kind"] for trace in planned.json["traces"]] == kinds
+    assert cli(*forget_them).status == 1 and bytes_of(home) == before
+    done = cli(*forget_them, "--yes")
+    assert (done.status, done.json["done"], done.json["kept"], done.json["failed"]) == (0, True, [], [])
+    assert [kind for kind, _ in done.json["removed"]] == kinds
+    assert bytes_of(home) == left and PERSON in RemovedCodes.read(home)
+    assert cli("forget", home / "nowhere", PERSON, "--everywhere").status == 2
+    assert cli("forget", home, PERSON, "--everywhere", "--bundles", home).status == 2
 
 
 def bytes_of(folder: Path) -> list[str]:

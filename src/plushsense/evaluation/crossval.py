@@ -47,7 +47,8 @@ _VERSION = 1
 def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0) -> list[Fold]:
     """Return the folds of ``split`` as indices of windows: train and validation into ``train``, test into ``score``.
 
-    Unless the split is leaky, windows that overlap a test recording in its stream are not used for training.
+    Unless the split is leaky, windows that overlap a test recording in its stream are not used for training. Where
+    people are on both sides, all others of recordings that are not scored, as the idle parts of streams, are.
 
     Raises:
         BadInput: when the two sets have different labels or inputs, or are too small for the split.
@@ -63,14 +64,16 @@ def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0
         return make_folds(split, score.subject, score.y, seed, _ids(score))
     recordings = _Recordings.of(train, score)
     of_train, of_score = recordings.place(train), recordings.place(score)
+    # The idle parts of a stream count as one recording: held back, a network would learn no idleness from that stream.
+    only_trained = ~np.isin(of_train, of_score) & (not split.separates_people)
     divided = []
     for fold in make_folds(split, recordings.subject, recordings.y, seed, recordings.ids):
         keep = purge(train.stream, train.window_rows, *recordings.rows(fold.test))
         windows = Fold(
             fold.name,
             fold.subjects,
-            np.flatnonzero(np.isin(of_train, fold.train) & keep),
-            np.flatnonzero(np.isin(of_train, fold.validation) & keep),
+            np.flatnonzero((np.isin(of_train, fold.train) | only_trained) & keep),
+            np.flatnonzero(np.isin(of_train, fold.validation) & ~only_trained & keep),
             np.flatnonzero(np.isin(of_score, fold.test)),
         )
         _require_windows(windows, fold, split)

@@ -184,7 +184,6 @@ def _require_gestures(used: Sequence[str], labels: Sequence[str], subject: str, 
     # Fewer gestures make the others worse: on makeability, up to 5 of 10 cost nobody more than one recording.
     needed = max(2, -(-len(labels) // 2))
     if len(used) < needed:
-        missing = ", ".join(label for label in labels if label not in used)
         raise BadInput(
             "The recordings of {subject} are too few to adapt to: {needed} of the bundle's {gestures} gestures with "
             "{least} recordings each are needed, better all; there are {used}. Record more of: {missing}.",
@@ -193,7 +192,7 @@ def _require_gestures(used: Sequence[str], labels: Sequence[str], subject: str, 
             gestures=len(labels),
             least=spec.least,
             used=len(used),
-            missing=missing,
+            missing=[label for label in labels if label not in used],
         )
 
 

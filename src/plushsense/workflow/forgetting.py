@@ -208,6 +208,16 @@ class HomeTraces:
     pseudonyms: tuple[str, ...] = ()
     published: tuple[str, ...] = ()
 
+    def to_json(self) -> dict[str, object]:
+        """Return plain values for JSON."""
+        return {
+            "person": self.person,
+            "traces": [{"kind": t.kind, "path": str(t.path), "certain": t.certain} for t in self.traces],
+            "mentions": [str(path) for path in self.mentions],
+            "pseudonyms": list(self.pseudonyms),
+            "published": list(self.published),
+        }
+
 
 @dataclass(frozen=True)
 class RemovalReceipt:

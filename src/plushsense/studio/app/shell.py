@@ -285,15 +285,19 @@ def _in_use_bar(page: Page) -> None:
         bar.set_visibility(bool(uses))
         with bar:
             for use in uses:
-                text = words(_IN_USE[use.page], name=use.name, toy=use.toy)
+                text = words(_IN_USE[use.page], name=use.name, toy=words.toy(use.toy))
                 with ui.row().classes("w-full items-center"):
                     ui.label(f"● {text}").classes("text-bold ps-break")
                     show = words(_SHOW_USE[use.page])
                     link = ui.link(show, address(use.page, session=use.name)).classes("ps-link")
-                    named(link, f"{show}: {use.name or use.toy}")
+                    named(link, f"{show}: {use.name or words.toy(use.toy)}")
                     if not use.name:
                         button(
-                            "stop-use", words("Stop"), on_page(partial(stop, use)), "outline color=white", about=use.toy
+                            "stop-use",
+                            words("Stop"),
+                            on_page(partial(stop, use)),
+                            "outline color=white",
+                            about=words.toy(use.toy),
                         )
 
     draw()

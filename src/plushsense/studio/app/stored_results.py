@@ -23,6 +23,7 @@ from plushsense.dataset.store import HEAD
 from plushsense.evaluation.scores import Predictions, read_predictions
 from plushsense.experiments.sweep.folder import SUMMARY as SWEEP
 from plushsense.experiments.sweep.folder import TRIALS_CSV, prediction_files
+from plushsense.experiments.sweep.grid import GRID_TRAINING
 from plushsense.models.bundle import Bundle, known_people
 from plushsense.scoring import metrics
 from plushsense.studio.app.shell import AFFECT_SIGNS
@@ -210,6 +211,11 @@ class ResultRow:
         )
 
     @property
+    def untested(self) -> bool:
+        """Return whether this is a network for everybody without a score, as one that was stopped before its test."""
+        return self.kind == TRAINING and self.accuracy is None and self.split != PERSONAL
+
+    @property
     def subject_independent(self) -> bool:
         """Return whether the people of the test are others than those of the training."""
         return self.split.startswith(("leave-one-subject-out", "by-subject", WHOLE_PEOPLE))
@@ -278,6 +284,8 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
     # Recordings at rest, of which there are more, are scored apart where people are left out.
     recordings = sum(one["recordings"] for one in people) if apart else table["by_recording"]["recordings"]
     network = (model["symbol"], *model["filters"], model["padding"], model.get("norm"))
+    # The context that was asked for, as a bundle states it; without streams, another one is used.
+    asked = config["evaluation"]["train_context"] or config["windows"]["context"]
     return [
         ResultRow(
             str(path.parent),
@@ -309,7 +317,7 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
             tuple((one["subject"], one["accuracy"]) for one in people),
             _rest(table["nobody"], apart),
             table["learning"],
-            _settings(table["dataset"]["hash"], table["train_context"], config["preset"], training, network),
+            _settings(table["dataset"]["hash"], asked, config["preset"], training, network),
             path.parent,
         )
     ]
@@ -356,6 +364,21 @@ def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
                 )
             )
     return rows
+
+
+def trial_settings(row: ResultRow) -> dict[str, Any]:
+    """Return the settings with which a trial of a sweep or search was trained, for another training.
+
+    Raises:
+        BadInput: if the files of the sweep cannot be read.
+    """
+    grid = read_json(row.path / SWEEP)["grid"]
+    with (row.path / TRIALS_CSV).open(encoding="utf-8", newline="") as file:
+        trial = next(each for each in csv.DictReader(file) if each["trial"] == row.trial)
+    kept = ("preset", "context", "padding", "norm", "classes", "window_s", "step_s", *GRID_TRAINING)
+    settings = {key: grid[key] for key in kept if grid.get(key) is not None}
+    network = {"arch": trial["arch"], "filters": trial["filters"].replace("/", ",")}
+    return {**settings, **network, "epochs": int(trial["epochs"]), "batch": int(trial["batch"])}
 
 
 def of_bundle(path: Path, known: Any) -> list[ResultRow]:
@@ -498,9 +521,13 @@ class DatasetCounts:
     simulated: bool
 
 
-def recommended(networks: Mapping[Path, ResultRow]) -> str:
-    """Return the path of the newest of `StoredResults.networks` that may be recommended, or ""."""
-    return next((str(path) for path, row in networks.items() if row.usable), "")
+def recommended(networks: Mapping[Path, ResultRow], to_try: bool = False) -> str:
+    """Return the path of the newest of `StoredResults.networks` that may be recommended, or "".
+
+    With ``to_try``, that of the newest one that nobody has tested takes its place if there is none.
+    """
+    usable = (str(path) for path, row in networks.items() if row.usable)
+    return next(usable, next((str(path) for path, row in networks.items() if to_try and row.untested), ""))
 
 
 class StoredResults:

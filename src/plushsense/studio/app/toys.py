@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import threading
 import time
 from collections.abc import Callable
@@ -293,28 +292,9 @@ class ToyTrial:
     layout: str = ""
 
 
-_TITLES: Texts = {
-    "virtual": "Virtual toy (simulation), person {place}",
-    "serial": "Toy on the cable {place}",
-    "ble": "Bluetooth toy {place}",
-    "tcp": "Toy in the network {place}",
-    "replay": "Recording {place}",
-}
-
-
-def toy_title(words: Words, url: str) -> str:
-    """Return the text for a toy: how it is connected and where, or the URL if that is no valid one."""
-    with contextlib.suppress(PlushSenseError):
-        address = parse_url(url)
-        place = address.query.get("person", "1") if address.scheme == "virtual" else address.place
-        named = address.scheme in ("serial", "replay")
-        return words(_TITLES.get(address.scheme, url), place=re.split(r"[/\\]", place)[-1] if named else place)
-    return url
-
-
 def found_title(words: Words, toy: DeviceInfo) -> str:
     """Return the text for a toy that was found: its own name, if it has one."""
-    return toy_title(words, toy.url) if toy.kind in ("serial", "virtual") else f"{toy.name} · {toy.url}"
+    return words.toy(toy.url) if toy.kind in ("serial", "virtual") else f"{toy.name} · {toy.url}"
 
 
 def described(words: Words, toy: DeviceInfo) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Filler, Message, single_stops
+from plushsense.devices.opening import parse_url
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
 """Maps language code to name.
@@ -45,6 +46,13 @@ CHANNEL_KINDS: Texts = {
     "angular rate": "Rotation",
 }
 """Names of the groups of channels."""
+_TOYS: Texts = {
+    "virtual": "Virtual toy (simulation), person {place}",
+    "serial": "Toy on the cable {place}",
+    "ble": "Bluetooth toy {place}",
+    "tcp": "Toy in the network {place}",
+    "replay": "Recording {place}",
+}
 AFFECTS: Texts = {"positive": "positive", "neutral": "neutral", "negative": "negative", "none": "none"}
 
 
@@ -119,6 +127,15 @@ class Words:
         """Return the name of a sensor channel in this language, or ``name`` itself if it has none."""
         return self(in_context("channel", name))
 
+    def toy(self, url: str) -> str:
+        """Return the text for a toy: how it is connected and where, or the URL if that is no valid one."""
+        with suppress(PlushSenseError):
+            address = parse_url(url)
+            place = address.query.get("person", "1") if address.scheme == "virtual" else address.place
+            named = address.scheme in ("serial", "replay")
+            return self(_TOYS.get(address.scheme, url), place=re.split(r"[/\\]", place)[-1] if named else place)
+        return url
+
     def check(self, name: str) -> str:
         """Return the name of a quality check in this language."""
         return self(in_context("check", name.replace("-", " ")))
@@ -148,7 +165,7 @@ class Words:
             stored = message
         template = stored.get("template", "")
         translation = self._catalog.get(template) if template else ""
-        if not translation and self.language == next(iter(LANGUAGES)) and _has_message(stored.get("values", {})):
+        if not translation and self.language == next(iter(LANGUAGES)) and _is_worded(stored.get("values", {})):
             translation = template
         if translation:
             # A stored job of another version may lack a value.
@@ -166,11 +183,15 @@ class Words:
         return self(AFFECTS[affect or "none"])
 
 
-def _has_message(value: object) -> bool:
-    """Return whether there is a further message among values, which may be worded in another way."""
+_URLS = ("url", "toy")
+"""Keys of the values of messages that are addresses of toys."""
+
+
+def _is_worded(value: object) -> bool:
+    """Return whether there is a further message among values, or a toy, which pages word in another way."""
     if isinstance(value, Mapping):
-        return "template" in value or any(map(_has_message, value.values()))
-    return isinstance(value, Message) or (isinstance(value, list | tuple) and any(map(_has_message, value)))
+        return not value.keys().isdisjoint(("template", *_URLS)) or any(map(_is_worded, value.values()))
+    return isinstance(value, Message) or (isinstance(value, list | tuple) and any(map(_is_worded, value)))
 
 
 class _FormFiller(Filler):
@@ -205,9 +226,11 @@ class _ValueFiller(_FormFiller):
             return words.sentence(value)
         if isinstance(value, Path):
             return value.name
+        if key in _URLS:
+            return words.toy(str(value))
         if key in ("channel", "channels"):
             return words.channel(str(value))
-        return words.gesture(str(value)) if key in ("gesture", "gestures") else value
+        return words.gesture(str(value)) if key in ("gesture", "gestures", "missing") else value
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if isinstance(value, float) and "|" not in format_spec:

@@ -15,7 +15,7 @@ from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, named, on_change, tag
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.widgets.elements import admitting, errors_beside
+from plushsense.studio.widgets.elements import admitting, ask, errors_beside
 
 _NAMED = 5
 
@@ -98,12 +98,36 @@ def review_address(dataset: Path, sessions: Sequence[Path]) -> str:
 
 
 async def take_back(page: Page, dataset: Path, sessions: Sequence[str], then: Callable[[], Any]) -> None:
-    """Take sessions (see `session_name`) out of a data set again, and call ``then``."""
+    """Take sessions (see `session_name`) out of a data set again, and call ``then``; ask if decisions would be lost."""
+    words = page.words
+
+    async def go(_: str = "") -> None:
+        with page.show_errors():
+            page.workspace.part(Jobs).check_unused(dataset)
+            await run.io_bound(_take_back, page.workspace, dataset, sessions)
+            if inspect.isawaitable(done := then()):
+                await done
+
     with page.show_errors():
-        page.workspace.part(Jobs).check_unused(dataset)
-        await run.io_bound(_take_back, page.workspace, dataset, sessions)
-        if inspect.isawaitable(done := then()):
-            await done
+        if not (decided := await run.io_bound(_decided, dataset, sessions)):
+            await go()
+            return
+        title = words(
+            "In the data set, {n:recording is|recordings are} trimmed, left out or decided otherwise since. Taking out "
+            "{sessions} drops these decisions.",
+            n=decided,
+            sessions=join_names(sessions, most=_NAMED),
+        )
+        ask(words, title, words("Take out"), go)
+
+
+def _decided(dataset: Path, sessions: Sequence[str]) -> int:
+    """Return how many recordings of sessions somebody has decided about since they were recorded."""
+    from plushsense.dataset.marks import RECORDER, MarkState, read_marks
+
+    theirs = tuple(f"{name}/" for name in sessions)
+    states = (state for name, state in read_marks(dataset).items() if name.startswith(theirs))
+    return sum(s != MarkState(excluded=s.excluded and s.excluded_by == RECORDER) for s in states)
 
 
 def _take_back(workspace: Workspace, dataset: Path, sessions: Sequence[str]) -> None:

@@ -41,6 +41,7 @@ _VERDICTS: Texts = {
         "Here it reads about {right} of 10 moments, with those at rest, but this test is too easy: parts of the same "
         "touches were trained on. Guessing gives {chance} of 10."
     ),
+    "untested": "Nobody has tested this network, so it may be guessing. You can try it; evaluate it on the page Train.",
     "unusable": "Not usable yet, because it may be guessing: record two more people, or each gesture two more times.",
 }
 
@@ -66,6 +67,8 @@ def headline(w: Words, row: ResultRow) -> str:
     """Return the main sentence on a result."""
     if row.split == PERSONAL:
         return w("It is adapted to one person. How well it reads others is not known.")
+    if row.untested:
+        return w(_VERDICTS["untested"])
     if row.accuracy is None or not row.classes:
         return w("This result has no score.")
     kind = "leaky" if row.leaky else "new" if row.subject_independent else "known"

@@ -102,6 +102,9 @@ class ForgetDialog:
         scroll = ui.column().classes("ps-scroll w-full ps-no-gap").props("tabindex=0 role=group")
         with tag(named(scroll, words("What is known about {person}", person=found.person)), "forget-traces"):
             self._ticks = [(trace, self._tick(trace)) for trace in found.traces]
+        if any(trace.kind == "backup" for trace in found.traces):
+            about = words("A backup that is not ticked still holds this person, and can bring the recordings back.")
+            tag(ui.label(about).classes("ps-note"), "forget-backup")
         home = self._workspace.folder
         rest = [str(path.relative_to(home) if home in path.parents else path) for path in found.mentions]
         folded_lines(words, words("Files that may name this person; look through them: {n}", n=len(rest)), rest)

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from nicegui import context, run, ui
 
 from plushsense.core.errors import need
+from plushsense.core.sentences import join_names
 from plushsense.dataset.files import DATASETS
 from plushsense.studio.app.jobs import RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, button, html, named, on_change, on_page, tag
@@ -32,7 +33,7 @@ from plushsense.studio.pages.home.sections import (
 )
 from plushsense.studio.pages.home.toy import ToySection
 from plushsense.studio.widgets.destination import Destination
-from plushsense.studio.widgets.elements import style
+from plushsense.studio.widgets.elements import ask, style
 
 _NEXT: Texts = {
     "try": (
@@ -51,6 +52,7 @@ _NEXT: Texts = {
         "The network “{name}” is not usable yet, because it may be guessing. Record two more people, or each gesture "
         "two more times, then train again."
     ),
+    "test": "Nobody has tested the network “{name}” yet, so it may be guessing. Try it live, or evaluate it.",
     "live": "The network “{name}” is trained. Watch it live, or export it for the toy.",
 }
 
@@ -65,6 +67,7 @@ _NEXT_BUTTONS: Texts = {
     "more": "Record",
     "train": "Train",
     "improve": "Record",
+    "test": "Watch it live",
     "live": "Watch it live",
     "export": "Export",
 }
@@ -134,7 +137,7 @@ def invitation(page: Page) -> None:
         button("invite-new", words("New address"), show)
 
 
-def project_section(page: Page, jobs: Jobs) -> None:
+def project_section(page: Page, jobs: Jobs, overview: Overview) -> None:
     """Build the section; the file is among the backups, and is opened as one, or where files are imported."""
     words, workspace = page.words, page.workspace
 
@@ -150,6 +153,19 @@ def project_section(page: Page, jobs: Jobs) -> None:
         with page.show_errors():
             jobs.start("save", spec, words("Saving “{name}”", name=name))
 
+    async def check() -> None:
+        """Start to save; ask before if there are sessions that are in no data set, so that they are not saved."""
+        found = await run.io_bound(overview.look)
+        waiting = [f"{s.subject}/{s.session}" for s in found.sessions if s.waiting] if found else []
+        if not waiting:
+            save()
+            return
+        title = words(
+            "Not in a data set yet, so not saved: {sessions}. Put them into a data set first.",
+            sessions=join_names(waiting, most=_NAMED),
+        )
+        ask(words, title, words("Save without them"), lambda _: save())
+
     with titled_card(page, "Everything in one file", "project"):
         about = words(
             "One file holds all data sets and networks, for another computer or a safe place. Opening it adds them and "
@@ -157,12 +173,13 @@ def project_section(page: Page, jobs: Jobs) -> None:
         )
         ui.label(about).classes("ps-dim")
         with ui.row().classes("ps-small-gap"):
-            button("save-everything", words("Save everything"), on_page(save), icon="save")
+            button("save-everything", words("Save everything"), on_page(check), icon="save")
             opener = button("open-everything", words("Open"), icon="folder_open")
             # In the browser, since it opens its dialog only as the answer to a click.
             opener.on("click", js_handler="""() => document.querySelector('[data-test="choose_files"]').click()""")
 
 
+_NAMED = 5
 MAKING = ("simulate", "import", "restore", "open")
 CHANGING = (*MAKING, "backup", "save", "forget", "check", "train", "sweep", "search", "export", "publish")
 # Enough data to train a network, but simulated within seconds.
@@ -186,7 +203,7 @@ async def show(page: Page) -> None:
             discarded = DiscardedSection(page, actions)
         with ui.column().classes("w-full"):
             ToySection(page, toys)
-            project_section(page, jobs)
+            project_section(page, jobs, overview)
             job_list = JobList(page, jobs)
             invitation(page)
 
@@ -254,7 +271,7 @@ class NextStepCard:
                     button("next-button", words(text), call, "unelevated size=lg color=primary")
                 trial = words("Try it with three gestures of your own")
                 button("try-three", trial, lambda: ui.navigate.to(address("live", trial="1")))
-                if second := {"try": "record", "live": "export"}.get(step.key):
+                if second := {"try": "record", "test": "train", "live": "export"}.get(step.key):
                     button("", words(_NEXT_BUTTONS[second]), lambda: self._go(second, step))
 
     def _do(self, step: NextStep) -> None:

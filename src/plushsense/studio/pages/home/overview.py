@@ -162,7 +162,10 @@ def next_step(summary: WorkspaceSummary, *, toy: str = "", virtual: bool = False
         return NextStep("review", "review", {"name": unreviewed[0].name})
     usable = next((b for b in bundles if b.score is not None and b.score.usable), None)
     if usable is None:
-        return NextStep("improve", "record", {"name": bundles[0].name})
+        untested = next((b for b in bundles if b.score is not None and b.score.untested), None)
+        if untested is None:
+            return NextStep("improve", "record", {"name": bundles[0].name})
+        return NextStep("test", "live", {"name": untested.name, "model": untested.path})
     return NextStep("live", "live", {"name": usable.name, "model": usable.path})
 
 

@@ -149,7 +149,7 @@ class DiscardedSection:
             await change(lambda: workspace.delete(path), words("“{name}” is deleted.", name=name))
 
         def ask_delete() -> None:
-            title = words("Delete “{name}” for good? This cannot be undone.", name=name)
+            title = words("Delete “{name}” for good? Only a copy elsewhere can bring it back.", name=name)
             ask(words, title, words("Delete for good"), delete)
 
         with ui.row().classes("ps-row items-center w-full ps-small-gap"):

@@ -18,7 +18,6 @@ from plushsense.studio.app.toys import (
     ToyUse,
     described,
     found_title,
-    toy_title,
     with_layout,
 )
 from plushsense.studio.app.words import Texts
@@ -99,7 +98,7 @@ class ToySection:
                 ui.label(words("No toy is chosen yet.")).classes("ps-dim")
                 return
             with ui.row().classes("items-center ps-small-gap"):
-                tag(ui.label(words("Chosen: {toy}", toy=toy_title(words, toy))).classes("ps-break text-bold"), "chosen")
+                tag(ui.label(words("Chosen: {toy}", toy=words.toy(toy))).classes("ps-break text-bold"), "chosen")
                 if self._toys.simulated:
                     simulation_badge(self._page)
             if trial is not None:
@@ -140,7 +139,7 @@ class ToySection:
         words, toys = self._words, self._toys
         self._others.clear()
         since = words("given when the studio was started")
-        given = [(url, toy_title(words, url), since) for url in self._page.workspace.devices]
+        given = [(url, words.toy(url), since) for url in self._page.workspace.devices]
         found = [d for d in toys.listing.devices if d.kind != "virtual"]
         listed = [(d.url, found_title(words, d), described(words, d)) for d in found]
         with self._others:

@@ -19,7 +19,7 @@ from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
 from plushsense.studio.app.stored_results import ResultRow, StoredResults, recommended
-from plushsense.studio.app.toys import ToyInUseError, Toys, described, toy_title
+from plushsense.studio.app.toys import ToyInUseError, Toys, described
 from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL
 from plushsense.studio.pages.live import adapting, trial, validation_page
@@ -49,7 +49,7 @@ async def show(page: Page) -> None:
     words = page.words
     style()
     if "trial" in query():
-        trial.show(page, _person_panel)
+        trial.show(page, partial(_person_panel, free=False))
         return
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
@@ -76,8 +76,11 @@ async def show(page: Page) -> None:
     context.client.on_delete(reader.add_viewer(lambda: bool(recording.key)))
 
 
-def _person_panel(page: Page, reader: LiveReader) -> None:
-    """Add the buttons that direct the person of a virtual toy; they are hidden for any other toy."""
+def _person_panel(page: Page, reader: LiveReader, free: bool = True) -> None:
+    """Add the buttons that direct the person of a virtual toy; they are hidden for any other toy.
+
+    ``free``: also one that lets the person make any gesture, unasked.
+    """
     words = page.words
     box = named(ui.element("div").props("role=group").classes("w-full"), words("Let the virtual person do this:"))
     with tag(box, "virtual-person"):
@@ -105,7 +108,8 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
                 make, look = partial(direct, label), 'outline padding="3px 8px"'
                 button(f"do-{label}", words.gesture(label), make, look).classes("ps-note")
             button("do-nothing", words("Stop"), lambda: direct(""), "outline dense", icon="stop").classes("ps-note")
-            button("do-own", words("By themselves"), lambda: direct(None), "flat dense").classes("ps-note")
+            if free:
+                button("do-own", words("By themselves"), lambda: direct(None), "flat dense").classes("ps-note")
 
     on_change(reader.changed, update)
     update()
@@ -152,7 +156,8 @@ class _Controls:
                 self._bundles = {str(path): path.stem for path in self._workspace.bundles()}
                 chosen = str(choice.bundle) if choice.bundle else None
                 if chosen is None or (query().get("model") and not reader.now.running):
-                    chosen = query_path(self._workspace, "model", self._bundles, recommended(networks)) or None
+                    first = recommended(networks, to_try=True)
+                    chosen = query_path(self._workspace, "model", self._bundles, first) or None
                 with ui.column().classes("ps-no-gap"):
                     box = ui.select(self._bundles, value=chosen, label=words("Network"))
                     self._bundle = tag(box.classes("w-full"), "bundle")
@@ -277,7 +282,7 @@ class _Controls:
             control.set_enabled(not running)
         choice = reader.choice
         now = (
-            f": {self._recordings.get(choice.toy) or toy_title(words, choice.toy)} · {choice.bundle.stem}"
+            f": {self._recordings.get(choice.toy) or words.toy(choice.toy)} · {choice.bundle.stem}"
             if running and choice.bundle is not None
             else ""
         )
@@ -306,7 +311,7 @@ class _Controls:
     def _toy_options(self, url: str) -> dict[str, str]:
         """Return the toys to choose from: ``url``, those given at start, the virtual one and those found."""
         words, workspace = self._page.words, self._workspace
-        known = {one: toy_title(words, one) for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
+        known = {one: words.toy(one) for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
         found = [d for d in self._toys.listing.devices if d.kind != "virtual"]
         known |= {d.url: f"{d.name or d.url}: {described(words, d)}" for d in found}
         return known | self._recordings

@@ -8,30 +8,33 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import tomli_w
 from nicegui import context, run, ui
 
 from plushsense.core.errors import ConfigError, PlushSenseError
-from plushsense.core.gestures import load_gestures
+from plushsense.core.gestures import load_gestures, plain_label
 from plushsense.core.sentences import Message
 from plushsense.core.version import __version__
 from plushsense.dataset.privacy.removed import refuse_removed
 from plushsense.devices.opening import is_virtual, speed_of, with_speed
+from plushsense.models.bundle import Bundle
 from plushsense.recording.recorder import AutoRecording, Recorder, open_toy, prompt_virtual
 from plushsense.recording.session import OpenSession, SessionRequest, change_subject, session_folder, session_head
 from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.jobs import DONE, READY, RUNNING, UNFINISHED, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, heading, named, on_change, tag
-from plushsense.studio.app.toys import TappedDevice, Toys, ToyUse, toy_title
-from plushsense.studio.app.workspace import VIRTUAL, WORK, ChangeSignal, Workspace
+from plushsense.studio.app.toys import TappedDevice, Toys, ToyUse
+from plushsense.studio.app.workspace import BUNDLES, VIRTUAL, WORK, ChangeSignal, Workspace
 from plushsense.studio.pages.live.feed import Feed, LiveView, follow
 from plushsense.studio.pages.live.live_state import LiveChoice
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.widgets.elements import errors_beside, notice
 
 TITLE = "Try it with three gestures of your own"
+_SET = "plush-18"
 _GESTURES = ("Back stroke 1", "Tail pull", "Hold strong")
 _REPETITIONS = 5
 _COUNTDOWN_S = 2.0
@@ -71,12 +74,16 @@ class FirstTrial:
         Raises:
             PlushSenseError: if two gestures are equal, or the toy cannot be used.
         """
-        if len(set(gestures)) < len(gestures):
+        if len(set(map(plain_label, gestures))) < len(gestures):
             raise ConfigError("Choose three different gestures.")
+        url = self._workspace.toy or self._toys.choose(VIRTUAL)
+        for label in set(gestures) - set(load_gestures(_SET).labels):
+            self._workspace.check_name(label)
+            if is_virtual(url):
+                raise ConfigError("The virtual person cannot make “{gesture}”. Choose one of the list.", gesture=label)
         with self._lock:
             self.end()
             self._reader.stop()
-            url = self._workspace.toy or self._toys.choose(VIRTUAL)
             work = self._workspace.folder / WORK
             work.mkdir(parents=True, exist_ok=True)
             self._folder = Path(tempfile.mkdtemp(prefix=f"{UNFINISHED}trial-", dir=work))
@@ -90,7 +97,8 @@ class FirstTrial:
         self.changed.notify()
 
     def _record(self, url: str, gestures: Sequence[str], folder: Path) -> None:
-        protocol = {"name": "trial", "gesture_set": "plush-18", "gestures": list(gestures)}
+        own = dict.fromkeys(set(gestures) - set(load_gestures(_SET).labels), "neutral")
+        protocol = {"name": "trial", "gesture_set": _SET, "gestures": list(gestures), "affects": own}
         table = protocol | {"repetitions": _REPETITIONS, "countdown_s": _COUNTDOWN_S}
         plan = folder / "protocol.toml"
         plan.write_text(tomli_w.dumps(table), encoding="utf-8")
@@ -138,28 +146,35 @@ class FirstTrial:
                 return
             try:
                 self._reader.start(LiveChoice(self._workspace.toy, Path(job.result["bundle"]), reactions=""))
+                if self._reader.person is not None:
+                    # By themselves, virtual people make all gestures, most of which this network does not know.
+                    self._reader.direct("")
             except PlushSenseError as refusal:
                 self.end(refusal.message)
                 return
             self.state = _LIVE
         self.changed.notify()
 
-    def keep(self, code: str) -> str:
-        """Move the session to the recorded ones as that of the person ``code``, and return its name.
+    def keep(self, code: str) -> None:
+        """Move the session to the recorded ones, as that of the person ``code``, and copy the network to the others.
 
         Raises:
             PlushSenseError: if there is none to keep, or for an invalid code.
         """
         with self._lock:
             folder = self._folder
-            if self.state != _LIVE or folder is None or self.kept:
+            if self.state != _LIVE or folder is None or self.job is None or self.kept:
                 raise ConfigError("There are no recordings to keep.")
             (session,) = (folder / "recordings").glob("*/*")
-            refuse_removed(self._workspace.recordings, [code])
-            place = change_subject(session, code, self._workspace.recordings)
+            workspace = self._workspace
+            refuse_removed(workspace.recordings, [code])
+            place = change_subject(session, code, workspace.recordings)
+            bundle, person = Bundle.load(Path(self.job.result["bundle"])), [code]
+            origin = {**bundle.provenance, "subjects": person, "validation_subjects": person}
+            name = workspace.free_name(BUNDLES, f"trial {place.parent.name}", ".plush", separator=" ")
+            replace(bundle, provenance=origin).save(workspace.new(BUNDLES, f"{name}.plush"))
             self.kept = f"{place.parent.name}/{place.name}"
         self.changed.notify()
-        return self.kept
 
     def end(self, why: Message | None = None) -> None:
         """End the trial, because of ``why``, and remove its files; do nothing if there is none."""
@@ -251,7 +266,7 @@ class _TrialSection:
             self._bar.set_value(trial.job.progress.get("share", 0.0))
 
     def _choose(self) -> None:
-        words, labels = self._words, [g.label for g in load_gestures("plush-18").gestures if not g.nobody]
+        words, labels = self._words, [g.label for g in load_gestures(_SET).gestures if not g.nobody]
         if self._trial.failed:
             tag(notice(words.failure(self._trial.failed), "error"), "trial-failed")
         about = words(
@@ -262,12 +277,15 @@ class _TrialSection:
         )
         ui.label(about)
         options = {label: words.gesture(label) for label in labels}
+        fields = []
         with ui.row().classes("w-full ps-small-gap"):
-            fields = [
-                tag(ui.select(options, value=g, label=words("Gesture {n}", n=n)).classes("ps-wide"), f"gesture-{n}")
-                for n, g in enumerate(_GESTURES, start=1)
-            ]
-        toy = toy_title(words, self._page.workspace.toy or VIRTUAL)
+            for n, label in enumerate(_GESTURES, start=1):
+                name = words("Gesture {n}", n=n)
+                # Each has options of its own, to which it adds what is typed.
+                field = ui.select({**options}, value=label, label=name, with_input=True, new_value_mode="add-unique")
+                fields.append(tag(field.classes("ps-wide"), f"gesture-{n}"))
+        ui.label(words("Choose from the lists, or type gestures of your own and press Enter.")).classes("ps-note")
+        toy = words.toy(self._page.workspace.toy or VIRTUAL)
         ui.label(words("Toy: {toy}", toy=toy)).classes("ps-dim ps-break")
 
         async def begin() -> None:
@@ -308,23 +326,24 @@ class _TrialSection:
         words = self._words
         ui.label(words("Now touch the toy: below is what the network feels.")).classes("text-bold")
         about = words(
-            "This network is only for trying: it knows {n} recordings of one person, nobody has tested it, and it is "
-            "removed with the trial. A good one needs more people.",
+            "This network is only for trying: it knows {n} recordings of one person, and nobody has tested it. A good "
+            "one needs more people. Unless you keep it, it is removed with the trial.",
             n=_REPETITIONS * len(_GESTURES),
         )
         tag(ui.label(about), "trial-about")
         with ui.row().classes("items-start ps-small-gap"):
             if self._trial.kept:
-                kept = words("The recordings are kept as {name}.", name=self._trial.kept)
+                kept = words("The recordings are kept as {name}, and the network, too.", name=self._trial.kept)
                 tag(ui.label(kept).classes("text-bold"), "trial-kept")
             else:
-                code = tag(ui.input(words("Code of the person"), placeholder="S01"), "trial-code")
+                free = self._page.workspace.codes().next_free()
+                code = tag(ui.input(words("Code of the person"), value=free), "trial-code")
 
                 async def keep() -> None:
                     with errors_beside(self._page, code):
                         await run.io_bound(self._trial.keep, str(code.value or "").strip())
 
-                button("trial-keep", words("Keep the recordings"), keep)
+                button("trial-keep", words("Keep recordings and network"), keep)
             self._add_end(words("End the trial"))
 
     def _add_end(self, label: str) -> None:

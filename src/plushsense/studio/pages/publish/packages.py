@@ -288,7 +288,7 @@ class PackagesSection:
                 self._detail.clear()
                 set_address(address("publish"))
 
-        title = words("Delete “{name}” for good? This cannot be undone.", name=package.name)
+        title = words("Delete “{name}” for good? Only a copy elsewhere can bring it back.", name=package.name)
         ask(words, title, words("Delete for good"), confirmed)
 
     def _answers(self, package: PackageFacts, job: StudioJob | None) -> None:

@@ -12,7 +12,7 @@ from plushsense.core.gestures import AFFECTS, load_gestures, plain_label
 from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import ORDERS
 from plushsense.studio.app.shell import Page, button, named, tag
-from plushsense.studio.app.toys import found_title, toy_title
+from plushsense.studio.app.toys import found_title
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.controller import RecordController
 from plushsense.studio.widgets.elements import errors_beside, on_enter, summary
@@ -44,7 +44,7 @@ class ToyChoice:
     def __init__(self, page: Page, urls: Sequence[str], prefix: str = "") -> None:
         self._page, self._urls, words = page, urls, page.words
         label = words("Toy")
-        self._list = ui.select({u: toy_title(words, u) for u in urls}, value=urls[0], label=label)
+        self._list = ui.select({u: words.toy(u) for u in urls}, value=urls[0], label=label)
         named(tag(self._list, f"{prefix}toy"), label).style("width: 27rem; max-width: 100%")
         self._look = button(f"{prefix}look", words("Look for toys"), self._search)
         self._other = ui.input(label=words("Address of another toy")).props(
@@ -77,7 +77,7 @@ class ToyChoice:
             self._look.enable()
         if listing is None:
             return
-        options = {u: toy_title(words, u) for u in dict.fromkeys(self._urls)}
+        options = {u: words.toy(u) for u in dict.fromkeys(self._urls)}
         options |= {d.url: found_title(words, d) for d in listing.devices if d.url not in options}
         self._list.set_options(options, value=self._list.value)
         notes = [words.sentence(note) for note in listing.notes]

@@ -15,7 +15,7 @@ from plushsense.recording.plan import DEFAULT, load_protocol, wordings
 from plushsense.recording.session import PROTOCOL, SessionRequest, SessionSummary, check_subject
 from plushsense.studio.app.choices import Choices
 from plushsense.studio.app.shell import CHILD, Page, address, button, html, named, on_page, query, tag
-from plushsense.studio.app.toys import ToyInUseError, toy_title
+from plushsense.studio.app.toys import ToyInUseError
 from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import show_child
 from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice
@@ -141,7 +141,7 @@ class _SessionLists:
                 return
             self._describe(session)
             toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
-            titles = {u: toy_title(words, u) for u in toys}
+            titles = {u: words.toy(u) for u in toys}
             toy = ui.select(titles, value=toys[0], label=words("Toy")).style("width: 24rem; max-width: 100%")
             named(toy.props("outlined dense"), f"{words('Toy')}: {name}")
             go_on = button("", words("Continue"), None, "unelevated", about=name)

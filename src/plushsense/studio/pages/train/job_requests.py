@@ -14,7 +14,7 @@ from plushsense.dataset.store import HEAD
 from plushsense.models.arch import parse_filters, parse_symbol
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import RUNNING, Jobs
-from plushsense.studio.app.stored_results import ResultRow
+from plushsense.studio.app.stored_results import ResultRow, trial_settings
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BUNDLES, EXPORTS, Workspace, plain_name
 from plushsense.workflow.config import RunConfig, from_settings
@@ -147,11 +147,12 @@ def _evaluate(workspace: Workspace, dataset: Path, given: Mapping[str, Any]) -> 
 
 
 def export_request(workspace: Workspace, jobs: Jobs, row: ResultRow) -> JobRequest:
-    """Return the job that trains a network with the settings of an evaluation on everybody, and exports it."""
+    """Return the job that trains a network with the settings of an evaluation or a trial, and exports it."""
     name = free_name(workspace, jobs, workspace.title(Path(row.dataset)))
-    spec = {
+    settings = {"evaluation": str(row.proof)} if row.proof is not None else {"settings": trial_settings(row)}
+    spec: dict[str, Any] = {
         "dataset": row.dataset,
-        "evaluation": str(row.proof),
+        **settings,
         "out": str(workspace.new(BUNDLES, f"{name}.plush")),
         "place": str(workspace.new(EXPORTS, workspace.free_name(EXPORTS, plain_name(name, "export")))),
     }

@@ -29,6 +29,7 @@ from plushsense.studio.app.shell import (
 from plushsense.studio.app.stored_results import (
     HELD_BACK,
     TRAINING,
+    TRIAL,
     Confusion,
     MisreadRecording,
     ResultDetails,
@@ -153,7 +154,7 @@ class ResultDetailsView:
         with ui.row().classes("items-center ps-small-gap"):
             if row.bundle is not None:
                 network_links(w, row.bundle)
-            elif row.proof is not None and row.usable:
+            elif row.usable or (row.kind == TRIAL and not row.leaky and (row.accuracy or 0.0) > row.chance):
                 make = w("Train on everybody and export")
                 button("make-export", make, self._make_export, "unelevated", icon="memory")
             for kind, text in kinds.items():
