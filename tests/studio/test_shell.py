@@ -307,7 +307,12 @@ def hostile_home(home: Path, made: Path) -> Path:
     scored = {
         **evaluation(HOSTILE, HOSTILE, HOSTILE, 0.6, people=3),
         "model": {"symbol": HOSTILE, "filters": [HOSTILE], "padding": HOSTILE, "parameters": 9, "macs_per_step": 9},
-        "config": {"preset": HOSTILE, "training": {"epochs": HOSTILE}},
+        "config": {
+            "preset": HOSTILE,
+            "training": {"epochs": HOSTILE},
+            "windows": {"context": HOSTILE},
+            "evaluation": {"train_context": ""},
+        },
         "dataset": {"name": HOSTILE, "hash": HOSTILE},
         "simulated": True,
         "over": "subjects",
