@@ -24,7 +24,7 @@ TESTS = Path(__file__).parents[1]
 from plushsense.deploy.golden import EVENT, FAULT, HEAD, HEALTH, ToyRows, answers_of, column
 from plushsense.runtime.events import ENDED
 from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
-from plushsense.runtime.image import IntegerModel, image_head
+from plushsense.runtime.image import CALIBRATED_IMAGE_VERSION, IntegerModel, image_head
 from support.c_toy import Seat, seat
 from support.integers import any_frames, edged_model, models, plain_model, ruled_model, vector_model
 
@@ -458,7 +458,7 @@ def test_a_drill_of_bad_updates(sanitized: list[Path], tmp_path: Path) -> None:
     body = models[1].to_bytes()[16:]
     other_layout = sealed(body[:26] + bytes([body[26] ^ 1]) + body[27:])
     foreign = [(other_layout, OTHER_LAYOUT), (edged_model().to_bytes(), OTHER_LAYOUT)]
-    foreign.append((image_head(body, version=8) + body, OTHER_VERSION))
+    foreign.append((image_head(body, version=CALIBRATED_IMAGE_VERSION) + body, OTHER_VERSION))
     sound = [*models[1:], vector_model()]
     offered = [*((model.to_bytes(), OK) for model in sound), *2 * foreign]
     (tmp_path / "cases").write_bytes(

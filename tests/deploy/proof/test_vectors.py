@@ -20,7 +20,7 @@ from support.exports import bundle_of, exported
 
 def test_comparing_names_the_first_number_that_differs() -> None:
     labels = ("a", "b")
-    expected = np.arange(48, dtype=np.int32).reshape(3, 16)
+    expected = np.arange(60, dtype=np.int32).reshape(3, 20)
     expected[:, 0] = 0, 1, 2
 
     def seen(rows: np.ndarray, words: bytes = b"") -> tuple[int, int, str | None]:
@@ -30,25 +30,25 @@ def test_comparing_names_the_first_number_that_differs() -> None:
 
     assert seen(expected) == (0, 0, None)
     one = expected.copy()
-    one[1, 15] += 5
+    one[1, 19] += 5
     one[2, 4] -= 9
-    message = "row 1 (event, frame 17): the smoothed probability of 'b' should be 31 and is 36"
+    message = "row 1 (event, frame 21): the smoothed probability of 'b' should be 39 and is 44"
     assert seen(one) == (2, 9, message)
     logit = expected.copy()
-    logit[0, 12] = -1
-    assert seen(logit) == (1, 13, "row 0 (answer, frame 1): the logit of 'a' should be 12 and is -1")
+    logit[0, 16] = -1
+    assert seen(logit) == (1, 13, "row 0 (answer, frame 1): the logit of 'a' should be 16 and is -1")
     for row, column, name in ((0, 8, "answer"), (1, 8, "since"), (2, 5, "suspect"), (2, 2, "ms")):
         field, was = expected.copy(), int(expected[row, column])
         field[row, column] += 7
         kind = ("answer", "event", "health")[row]
-        message = f"row {row} ({kind}, frame {16 * row + 1}): '{name}' should be {was} and is {was + 7}"
+        message = f"row {row} ({kind}, frame {20 * row + 1}): '{name}' should be {was} and is {was + 7}"
         assert seen(field) == (1, 7, message)
-    assert seen(expected[:2]) == (1, 0, "row 2 (health, frame 33) is missing")
+    assert seen(expected[:2]) == (1, 0, "row 2 (health, frame 41) is missing")
     assert seen(np.concatenate([expected, expected[:1]])) == (1, 0, "row 3 (answer, frame 1) is one too many")
     assert seen(expected, b"Something.") == (1, 0, "Something")
     assert seen(expected[:0], b"Nothing.") == (3, 0, "Nothing; row 0 (answer, frame 1) is missing")
     far = expected.copy()
-    far[0, 12], high = -(1 << 31), (1 << 31) - 1
+    far[0, 16], high = -(1 << 31), (1 << 31) - 1
     assert compare(np.full_like(far, high), far.astype("<i4").tobytes(), labels).max_abs_diff == 2**32 - 1
 
 
@@ -60,7 +60,7 @@ BAD = [
     (lambda o: (o / "export.json").write_text("{"), "cannot be read"),
     (lambda o: (o / "golden" / "frames.bin").unlink(), "cannot be read"),
     (lambda o: (o / "golden" / "frames.bin").write_bytes(b"abc"), "no whole rows of 14 numbers"),
-    (lambda o: (o / "golden" / "answers.bin").write_bytes(bytes(4)), "no whole rows of 48 numbers"),
+    (lambda o: (o / "golden" / "answers.bin").write_bytes(bytes(4)), "no whole rows of 52 numbers"),
     (lambda o: (o / "model.plush").write_bytes(b"abc"), "model.plush"),
 ]
 

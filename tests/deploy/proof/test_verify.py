@@ -190,8 +190,8 @@ def test_the_same_on_every_chip(emulators: None, tmp_path: Path, name: str, monk
 def begun(vectors: Vectors, frames: int) -> Vectors:
     """The first frames of vectors, and their answers."""
     few = vectors.answers[vectors.answers[:, 1] < frames]
-    silences = tuple(at for at in vectors.silences if at < frames)
-    return replace(vectors, frames=vectors.frames[:frames], answers=few, silences=silences)
+    calls = tuple(call for call in vectors.calls if call.frame < frames)
+    return replace(vectors, frames=vectors.frames[:frames], answers=few, calls=calls)
 
 
 def test_ints_of_16_bits(target_here: Callable[[str], str], small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
