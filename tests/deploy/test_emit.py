@@ -158,7 +158,7 @@ def test_a_program_knows_ranges_gap_and_names(tmp_path: Path, c_compiler: str) -
     values = [f"PLUSH_{end}_{name}" for name in names for end in ("LOWEST", "HIGHEST")]
     header = (out / "plushsense.h").read_text(encoding="utf-8")
     states = {
-        "STATUS": "PLUSH_NOT_ALIGNED",
+        "STATUS": "PLUSH_MEMORY_NOT_ALIGNED",
         "STATE": "PLUSH_FAULT",
         "READING": "PLUSH_READING_LEFT_OUT",
         "KIND": "PLUSH_SURE_GESTURE",
@@ -179,7 +179,8 @@ def test_a_program_knows_ranges_gap_and_names(tmp_path: Path, c_compiler: str) -
     words = [c_compiler, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", f"-I{out}", str(main)]
     subprocess.run([*words, "-o", str(tmp_path / "run")], check=True)
     told = subprocess.run([str(tmp_path / "run")], capture_output=True, check=True, text=True).stdout.splitlines()
-    last = [line for name in ("not aligned", "fault", "left out", "sure gesture", "ended") for line in (name, "0")]
+    newest = ("memory not aligned", "fault", "left out", "sure gesture", "ended")
+    last = [line for name in newest for line in (name, "0")]
     assert told[:-1] == last, "the last of each enumeration, and none after it"
     bounds = [bound for both in zip(low, high, strict=True) for bound in both]
     assert list(map(int, told[-1].split())) == [model.layout.gap_ms, -(1 << 31), *bounds]

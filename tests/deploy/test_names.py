@@ -114,7 +114,7 @@ def test_several_models_in_one_program_answer_as_alone(
 def test_no_name_of_the_library_stays_without_the_prefix(named: dict[str, Path], needs: Callable[..., None]) -> None:
     """In files, symbols, guards and macros; but the command, and the file of the image, are called as ever."""
     for name, folder in named.items():
-        for path in (p for p in folder.rglob("*") if p.suffix in (".c", ".h", ".ino")):
+        for path in (p for p in folder.rglob("*") if p.suffix in (".c", ".h", ".ino", ".rs")):
             text = path.read_text(encoding="utf-8")
             assert re.findall(r"(?<!\w)(?:plush_|PLUSH)\w+(?!\w|\.bin)", text) == [], path
             assert re.findall(r"(?<!\w)plushsense\.[ch]\b", text) == [], path

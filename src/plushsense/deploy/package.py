@@ -47,9 +47,14 @@ IDF_TASKS = f"{IDF}/examples/RtosToy"
 SKETCH = f"{ARDUINO}/examples/PlushToy"
 LICENCE = "LICENSE"
 TWO_SLOTS = "examples/two_slots"
-_UPDATE = ("plush_update.h", "plush_update.c")
 ON_CHIP = "examples/verify_device"
-_DEVICE = ("plush_device.h", "plush_device.c", "plush_hooks.c")
+BINDING = "examples/binding"
+# Examples without templates: their folders in `c`, and their files.
+_PLAIN = {
+    TWO_SLOTS: ("two_slots", ("plush_update.h", "plush_update.c")),
+    ON_CHIP: ("device", ("plush_device.h", "plush_device.c", "plush_hooks.c", "verify_device.ino")),
+    BINDING: ("binding", ("plush_binding.h", "plush_binding.c", "plush_binding.rs")),
+}
 # Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
 NO_PAGE = "https://plushsense.invalid/"
 IDF_SINCE = "5.2"  # of ESP-IDF; the examples use its driver of I2C, which is new there
@@ -114,8 +119,8 @@ def export_files(bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes]) -
         f"{IDF_TASKS}/main/main.c": (c_folder / "rtos" / "main.c").read_text(encoding="utf-8"),
         **{f"{IDF_TASKS}/main/{file}": rendered[file] for file in ("plush_fake.h", "plush_fake.c")},
     }
-    texts |= {f"{TWO_SLOTS}/{f}": (c_folder / "two_slots" / f).read_text(encoding="utf-8") for f in _UPDATE}
-    texts |= {f"{ON_CHIP}/{f}": (c_folder / "device" / f).read_text(encoding="utf-8") for f in _DEVICE}
+    for example, (folder, names) in _PLAIN.items():
+        texts |= {f"{example}/{f}": (c_folder / folder / f).read_text(encoding="utf-8") for f in names}
     harness = (c_folder / "harness.c").read_text(encoding="utf-8")
     texts[f"{ON_CHIP}/plush_harness.c"] = f"#define PLUSH_HARNESS_DEVICE 1\n{harness}"
     for file in _WIRE:

@@ -24,6 +24,7 @@ from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.quantize import integer_model
 from plushsense.deploy.targets import TARGETS, CompileSpec, build
 from support.exports import bundle_of
+from support.virtual_boards import run
 
 HOOKS = Path(__file__).parents[1] / "boards" / "chip" / "hooks.c"
 STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Werror")
@@ -175,6 +176,30 @@ def served(program: Path | None, sent: Change = bytes, received: Change = bytes)
             assert process.wait(10) == 0, "a sanitizer complained"
 
 
+@pytest.mark.parametrize("board", ["arduino", "pico"])
+def test_the_hooks_of_arduino_and_of_the_pico_sdk(
+    board: str,
+    no_scenarios: None,
+    export: Path,
+    needs: Callable[..., None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With stand-ins for both, on standard input and output: neither ran on a board."""
+    needs("gcc", "g++")
+    on_chip, stubs, program = export / ON_CHIP, HOOKS.parents[1] / board, tmp_path / "program"
+    includes = [f"-I{folder}" for folder in (export, on_chip, stubs)]
+    define = "-DARDUINO=10819" if board == "arduino" else "-DLIB_PICO_STDIO=1"
+    objects = []
+    for source in (export / "plushsense.c", export / "plush_model.c", *sorted(on_chip.glob("*.c"))):
+        objects.append(tmp_path / f"{source.stem}.o")
+        run("gcc", "-std=c99", define, *STRICT, *includes, "-c", source, "-o", objects[-1])
+    run("g++", "-std=c++17", *STRICT, *includes, stubs / "verify.cpp", *objects, "-o", program)
+    with served(program) as url:
+        code, report, error = verified(capsys, export, url)
+    assert code == 0 and report["passed"] and report["decisions"] > 30, error
+
+
 @pytest.mark.exhaustive
 def test_scenarios_go_over_the_link_too(export: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With models of their own. The messages of a boot loader come first."""
@@ -197,7 +222,7 @@ def test_wrong_answers_and_words_of_a_chip(
 ) -> None:
     for n, (old, new, words) in enumerate(
         (
-            ("(t * times + half(after)) >> after;", "(t * times) >> after;", "should be"),
+            ("((2u * t * times >> after) + 1u) >> 1;", "(2u * t * times >> after) >> 1;", "should be"),
             ("#define HEAD_BYTES 16u", "#define HEAD_BYTES 20u", "plush_begin() says PLUSH_DAMAGED"),
         )
     ):

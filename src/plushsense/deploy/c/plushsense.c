@@ -2213,7 +2213,7 @@ static int leaves_out(plush_toy *toy, uint32_t ms)
         if (ms == seen && toy->follows)
             toy->bad_stamps++;
     } else if (early || toy->follows) {
-        toy->follows &= (uint8_t)early;
+        toy->follows = (uint8_t)(toy->follows & early);
         toy->bad_stamps++;
         toy->reading = PLUSH_READING_LEFT_OUT;
         return 1;

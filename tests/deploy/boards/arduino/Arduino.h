@@ -1,4 +1,4 @@
-// As much of an Arduino core as PlushToy.ino asks for, on a clock of the test's own.
+// As much of an Arduino core as PlushToy.ino and verify_device.ino ask for, on a clock of the test's own.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -9,6 +9,7 @@
 
 uint32_t micros();
 uint32_t millis();
+void yield();
 void pinMode(uint8_t pin, uint8_t mode);
 void analogWrite(uint8_t pin, int value);
 void tone(uint8_t pin, unsigned int hz, unsigned long ms = 0);

@@ -2,8 +2,9 @@
  * plushsense verify EXPORT --device URL: this program on a chip, and the computer at the other end of its UART.
  *
  * Compile plush_device.c, plush_harness.c and plush_hooks.c with plushsense.c and plush_model.c of the export, write
- * plush_hook_read() and plush_hook_write() (plush_hooks.c), and call plush_device_run() where your program begins. Nothing
- * else may write to that UART, and no log.
+ * plush_hook_begin(), plush_hook_read() and plush_hook_write() (those of ESP-IDF and the Pico SDK are in plush_hooks.c), and
+ * call plush_device_run() where your program begins. On an Arduino this folder is a sketch that does all of it, with the
+ * library of the export. Nothing else may write to that UART, and no log.
  *
  * Packets go both ways: the bytes 'P' and 'V', a letter, the length of what it holds (16 bits), that, and the CRC-32 of
  * letter, length and content; numbers begin with their lowest byte. The computer sends only what it is asked for:
@@ -37,7 +38,7 @@ extern "C" {
 #define PLUSH_DEVICE_ROOM_BYTES (PLUSH_MODEL_BYTES + 1024u)
 #endif
 
-/* Yours to write, in plush_hooks.c or in a file of your own. */
+/* Yours to write where plush_hooks.c has none, there or in a file of your own. */
 void plush_hook_begin(void);         /* once, before the others */
 uint8_t plush_hook_read(void);       /* the next byte from the computer; waits for it */
 void plush_hook_write(uint8_t byte); /* to the computer */

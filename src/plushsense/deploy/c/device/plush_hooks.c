@@ -4,7 +4,7 @@
 /* ---- Bytes ----------------------------------------------------------------------------------------------------- */
 
 /* They must wait: no byte may be lost or left out. Wherever another file has them, define PLUSH_HOOKS_ELSEWHERE. */
-#if defined(PLUSH_HOOKS_ELSEWHERE)
+#if defined(PLUSH_HOOKS_ELSEWHERE) || defined(ARDUINO) /* in verify_device.ino */
 #elif defined(ESP_PLATFORM)
 #include "driver/uart.h"
 #include "freertos/FreeRTOS.h"
@@ -34,6 +34,28 @@ uint8_t plush_hook_read(void)
 void plush_hook_write(uint8_t byte)
 {
     uart_write_bytes(UART_NUM_0, &byte, 1);
+}
+#elif defined(LIB_PICO_STDIO) /* the Pico SDK: UART or USB, as the target has it */
+#include "pico/stdio.h"
+
+void plush_hook_begin(void)
+{
+    stdio_init_all();
+}
+
+uint8_t plush_hook_read(void)
+{
+    int byte;
+
+    do
+        byte = getchar_timeout_us(1000);
+    while (byte < 0);
+    return (uint8_t)byte;
+}
+
+void plush_hook_write(uint8_t byte)
+{
+    putchar_raw(byte);
 }
 #else
 #error "Write plush_hook_begin(), plush_hook_read() and plush_hook_write() for your UART here."

@@ -1,0 +1,3 @@
+#include "plush_device.h"
+
+int main() { plush_device_run(); }
