@@ -36,7 +36,7 @@ def test_comparing_names_the_first_number_that_differs() -> None:
     assert seen(one) == (2, 9, message)
     logit = expected.copy()
     logit[0, 16] = -1
-    assert seen(logit) == (1, 13, "row 0 (answer, frame 1): the logit of 'a' should be 16 and is -1")
+    assert seen(logit) == (1, 17, "row 0 (answer, frame 1): the logit of 'a' should be 16 and is -1")
     for row, column, name in ((0, 8, "answer"), (1, 8, "since"), (2, 5, "suspect"), (2, 2, "ms")):
         field, was = expected.copy(), int(expected[row, column])
         field[row, column] += 7
