@@ -36,7 +36,7 @@ _MARGIN = 0.1  # of the range of the data
 _SAFETY = 2  # fault_ms is at least this many times the longest duration in the data
 _STILL_SAFETY = 4  # and still_ms this many times
 _STILL_MS = 500
-_RESTING_SHARE = 0.1  # of the people; if more of them had a sensor still for _STILL_MS, it is one that rests at one value
+_QUIET_SHARE = 0.1  # of the people; if more of them had a sensor still for _STILL_MS, it is one that rests at one value
 _STILL_MOST_MS = 10_000
 _INT32 = -(1 << 31), (1 << 31) - 1
 
@@ -128,9 +128,9 @@ def _longest_still(frames: Frames, gap_ms: int) -> int:
 
 def _still_ms(longest: Sequence[int]) -> int:
     """Return the time after which repeats are a fault, or 0 for never, given the longest time of each person."""
-    resting = sum(ms >= _STILL_MS for ms in longest)
+    quiet = sum(ms >= _STILL_MS for ms in longest)
     still_ms = max(_STILL_MS, _STILL_SAFETY * max(longest))
-    return 0 if resting > _RESTING_SHARE * len(longest) or still_ms > _STILL_MOST_MS else still_ms
+    return 0 if quiet > _QUIET_SHARE * len(longest) or still_ms > _STILL_MOST_MS else still_ms
 
 
 def _long_wrong(
