@@ -18,7 +18,10 @@ from hypothesis import strategies as st
 
 TESTS = Path(__file__).parents[1]
 
-from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, answers_of, column
+from plushsense.core.recorder_csv import Frames, write_recording
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.deploy.golden import ANSWER, COLUMNS, EVENT, FAULT, HEALTH, answers_of, column
+from plushsense.deploy.quantize import integer_model
 from plushsense.models.arch import ConvLayer
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import BEGUN, NO_GESTURE, EventSettings
@@ -28,8 +31,10 @@ from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel, memory_bytes
 from plushsense.runtime.integer import MOST_REACH
 from plushsense.runtime.machine import Sample, ToyMachine
+from plushsense.tuning.decisions import fit_health
 from plushsense.windows.clock import burst_ms
 from support.c_toy import answers, seat
+from support.exports import bundle_of
 from support.integers import INT32, any_frames, any_network, edged_model, models, plain_model, ruled_model
 
 OK, TOO_SMALL, NOT_ALIGNED, MEMORY_NOT_ALIGNED = 0, 4, 7, 8
@@ -272,6 +277,27 @@ def test_a_single_impossible_time_is_as_a_lost_frame(c_library: Any, ms: int) ->
     stray[301, 0] = ms
     reset = seat(c_library, model).push(stray)
     assert np.array_equal(reset, answers_of(model, stray)) and answers(reset)[-1, 7] == 2
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_quiet_sensor_rests_without_a_fault(c_library: Any, tmp_path: Path, quiet: bool) -> None:
+    """A filtered sensor of 8 bits rests at one value for 2 s in training, and for a minute in the toy."""
+    rng = np.random.default_rng(0)
+    touch = np.rint(np.cumsum(rng.normal(size=(800, 3)), axis=0)).astype(np.int64) * 8
+    touch[200:400] = touch[200]
+    values = touch if quiet else touch + rng.integers(-4, 5, touch.shape)
+    clock = 1000 + 10 * np.arange(len(values))
+    frames = Frames(values, clock, clock + 1_700_000_000_000)
+    (tmp_path / "raw" / "A").mkdir(parents=True)
+    model = integer_model(bundle_of("accel-3"))
+    write_recording(tmp_path / "raw" / "A" / "tap_1700000001000_800.csv", frames, model.layout)
+    imported = import_recordings(tmp_path / "raw", tmp_path / "ds", layout="accel-3", adopt_proposals=False)
+    health = fit_health(imported.dataset, ["A"]).settings
+    model = replace(model, rules=replace(model.rules, health=health))
+    still = np.column_stack([10 * np.arange(6800), np.concatenate([values, np.tile(values[:1], (6000, 1))])])
+    rows = seat(c_library, model).push(still)
+    assert np.array_equal(rows, answers_of(model, still))
+    assert (FAULT in column(rows, "state", HEALTH)) == (not quiet), health
 
 
 def test_toys_side_by_side(c_library: Any) -> None:

@@ -95,6 +95,7 @@ def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
         "a giant period": (12, struct.pack("<I", 1 << 31)),
         "gap 0": (16, struct.pack("<I", 0)),
         "a gap beyond 32 bits of interpolation": (16, struct.pack("<I", (1 << 22) + 1)),
+        "a gap of 1001 samples": (16, struct.pack("<I", 1001 * 10)),
         "no units a ms": (20, struct.pack("<I", 0)),
         "no smoothing": (24, struct.pack("<H", 0)),
         "smoothing above 1": (24, struct.pack("<H", 32769)),

@@ -8,11 +8,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 from tests.support.sent_lines import DAMAGED, toy_of_lines
 
 from plushsense.core.errors import ConfigError, PlushSenseWarning
-from plushsense.core.recorder_csv import write_recording
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, write_recording
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import open_device
 from plushsense.live.loop import run_live
@@ -22,8 +24,6 @@ from plushsense.runtime.classifier import StreamClassifier
 @pytest.fixture()
 def recording(tmp_path, frames):
     """A recording of 400 rows with gaps, a clock reset and garbage, as a URL."""
-    from plushsense.core.layouts import load_layout
-
     path = tmp_path / "tap_1700000000000_400.csv"
     write_recording(path, frames(), load_layout("accel-3"))
     return f"replay://{path.as_posix()}?speed=0&layout=accel-3"
@@ -54,6 +54,24 @@ def test_a_replay_gives_what_pushing_its_frames_gives(bundle, recording):
     assert (summary.no_signal, summary.faults) == (3, 0)
     assert [e.kind for e in wanted[-1].events] == ["ended"]
     assert summary.to_dict()["counters"] == summary.counters
+
+
+def test_a_slow_toy_is_seen_from_the_summary(bundle, tmp_path):
+    """A frame of every 40 ms instead of 10: three of four samples are made up. One stamp goes back, one repeats."""
+    clock = np.arange(310) * 40
+    clock[[90, 100]] = clock[[89, 99]] - [1, 0]
+    values = np.random.default_rng(1).integers(-900, 900, (310, 3))
+    slow = Frames(values, clock, 1_700_000_000_000 + clock)
+    write_recording(tmp_path / "tap_1700000000000_310.csv", slow, load_layout("accel-3"))
+    warnings = []
+    with open_device(f"replay://{tmp_path}/tap_1700000000000_310.csv?speed=0&layout=accel-3") as device:
+        live = run_live(device, StreamClassifier(bundle()), warn=warnings.append)
+        assert live.summary().rate_hz is None
+        list(live)
+        summary = live.summary()
+    assert (summary.rate_hz, summary.bad_stamps) == (pytest.approx(25, abs=0.5), 2)
+    assert summary.interpolated == pytest.approx(3 * 309, abs=10)
+    assert warnings[0].startswith("The toy sends 25 frames a second by its clock, but the model reads 100")
 
 
 def test_it_stops_by_device_time_and_begins_anew(bundle, recording):

@@ -9,7 +9,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.runtime.health import Health, HealthSettings
-from plushsense.tuning.decisions import _longest, _repeats, fit_health
+from plushsense.tuning.decisions import _longest_still, fit_health
 
 ACCEL = load_layout("accel-3")
 
@@ -91,8 +91,8 @@ def test_an_end_stop_that_people_reach_is_believed(made):
     assert faults(fit.settings, reaching) == 0
 
 
-@pytest.mark.parametrize(("rows", "still_ms"), [(10, 500), (100, 2000), (600, 0)])
-def test_stillness_is_twice_what_was_seen_at_least_half_a_second_and_off_beyond_ten(made, rows, still_ms):
+@pytest.mark.parametrize(("rows", "still_ms"), [(10, 500), (40, 1600), (50, 0)])
+def test_stillness_is_four_times_what_was_seen_at_least_half_a_second_and_off_for_quiet_sensors(made, rows, still_ms):
     held = touched(0)
     held[1000 : 1000 + rows + 1] = held[1000]
     fit = fit_health(made(held), ["P1"])
@@ -101,12 +101,20 @@ def test_stillness_is_twice_what_was_seen_at_least_half_a_second_and_off_beyond_
     assert faults(fit.settings, held) == 0
 
 
+@pytest.mark.parametrize(("people", "rows", "still_ms"), [(1, 100, 4000), (2, 100, 0), (1, 300, 0)])
+def test_a_sensor_that_hung_with_one_of_many_people_is_not_quiet(made, people, rows, still_ms):
+    streams = [touched(seed, 400) for seed in range(10)]
+    for held in streams[:people]:
+        held[50 : 50 + rows + 1] = held[50]
+    assert fit_health(made(*streams), [f"P{n + 1}" for n in range(10)]).settings.still_ms == still_ms
+
+
 def test_repeats_over_a_gap_are_no_stillness():
     values = touched(0, 300)
     values[100:200] = values[100]
     frames = stream(values)
     frames.device_ms[150:] += 5000
-    assert _longest(frames.device_ms, _repeats(frames.values, frames.device_ms, ACCEL.gap_ms)) == 490
+    assert _longest_still(frames, ACCEL.gap_ms) == 490
 
 
 def test_nobody_leaves_the_plan_as_it_is(made):

@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames
-from plushsense.core.row_times import kept_rows
+from plushsense.core.row_times import bridged_ms, kept_rows, stray_rows
 from plushsense.windows.clock import SampleClock, burst_ms, resample, row_times_us
 
 pytestmark = pytest.mark.slow
@@ -156,7 +157,7 @@ def test_a_causal_rule_does_not_wait_longer_than_one_frame() -> None:
     assert clock.now_us == 40_000
 
 
-steps = st.lists(st.one_of(st.integers(0, 40), st.integers(90, 130), st.integers(-50, -1)), min_size=1, max_size=60)
+steps = st.lists(st.one_of(st.integers(0, 40), st.integers(90, 130), st.integers(-120, -1)), min_size=1, max_size=60)
 value = st.one_of(st.integers(-40_000, 40_000), st.sampled_from([-32768, 32767, 32768, -32769]))
 strays = st.lists(st.tuples(st.integers(0, 60), st.sampled_from([0, 0, 1, 9_000, 1 << 31])), max_size=12)
 
@@ -183,7 +184,13 @@ def test_stream_equals_batch_in_every_bit(data: st.DataObject, moves: list[int],
     rows = data.draw(st.lists(st.lists(value, min_size=3, max_size=3), min_size=len(clock), max_size=len(clock)))
     given_frames = frames(clock, rows)
     layout = replace(ACCEL, rate_hz=data.draw(st.sampled_from([100.0, 60.0])))
-    assert kept_rows(given_frames.device_ms, layout.gap_ms).tolist() == in_turn(clock, layout.gap_ms)
+    kept = kept_rows(given_frames.device_ms, layout.gap_ms)
+    assert kept.tolist() == in_turn(clock, layout.gap_ms)
+    bridged = bridged_ms(given_frames.device_ms, stray_rows(given_frames.device_ms, layout.gap_ms))
+    assert np.array_equal(bridged[kept], given_frames.device_ms[kept])
+    for a, b in itertools.pairwise(kept.tolist()):
+        if 0 <= bridged[b] - bridged[a] <= layout.gap_ms:
+            assert (np.diff(bridged[a : b + 1]) >= 0).all(), "rows left out between two that follow each other"
     batch = resample(given_frames, layout)
     live = streamed(given_frames, layout)
     assert len(batch) == len(live)

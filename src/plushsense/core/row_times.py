@@ -30,14 +30,19 @@ def kept_rows(device_ms: NDArray[np.int64], gap_ms: float) -> NDArray[np.int64]:
 
 
 def stray_rows(device_ms: NDArray[np.int64], gap_ms: float) -> NDArray[np.int64]:
-    """Return the rows that `kept_rows` leaves out between two rows that follow each other: only their time is wrong."""
-    left_out = np.setdiff1d(np.arange(len(device_ms) - 1), kept_rows(device_ms, gap_ms))
-    ahead = device_ms[left_out + 1] - device_ms[left_out - 1]
+    """Return the rows that `kept_rows` leaves out between two kept rows that follow each other: their time is wrong."""
+    kept = kept_rows(device_ms, gap_ms)
+    left_out = np.setdiff1d(np.arange(kept[-1] if len(kept) else 0), kept)
+    after = np.searchsorted(kept, left_out)
+    ahead = device_ms[kept[after]] - device_ms[kept[after - 1]]
     return left_out[(ahead >= 0) & (ahead <= gap_ms)]
 
 
 def bridged_ms(device_ms: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the times with those of ``rows`` half-way between the times before and after them."""
+    """Return the times with those of ``rows`` evenly between the times of the other rows before and after them."""
     times = device_ms.copy()
-    times[rows] = (times[rows - 1] + times[rows + 1]) // 2
+    others = np.setdiff1d(np.arange(len(times)), rows)
+    after = np.searchsorted(others, rows)
+    before, after = others[after - 1], others[after]
+    times[rows] = times[before] + (times[after] - times[before]) * (rows - before) // (after - before)
     return times

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
-from plushsense.core.row_times import bridged_ms, stray_rows
+from plushsense.core.row_times import kept_rows
 from plushsense.core.simulation import is_marked
 from plushsense.dataset.files import RECORDINGS_INDEX, STAMP, STREAMS_INDEX, IndexStamp, raw_files
 from plushsense.dataset.marks import MARKS, MarkState, read_marks
@@ -262,7 +262,7 @@ def _stream_id(folder: Path, read: _RawFile) -> str:
 
 def _stream_info(folder: Path, head: DatasetHead, read: _RawFile) -> StreamInfo:
     frames = read.result.frames
-    steps = np.diff(bridged_ms(frames.device_ms, stray_rows(frames.device_ms, head.layout.gap_ms)))
+    steps = np.diff(frames.device_ms[kept_rows(frames.device_ms, head.layout.gap_ms)])
     broken = (steps < 0) | (steps > head.layout.gap_ms)
     flags = import_flags(Examination(frames, head.layout, stream=True))
     return StreamInfo(

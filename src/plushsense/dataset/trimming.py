@@ -141,7 +141,7 @@ def _before(dataset: Dataset, info: RecordingInfo) -> Frames | None:
 def row_times_s(frames: Frames, gap_ms: float) -> NDArray[np.float64]:
     """Return the device time in s since the first row, of each row and of the end, (T + 1,).
 
-    Clock resets are 0 s. The time of a row in `stray_rows` is half-way between those around it.
+    Clock resets are 0 s. The times of `stray_rows` are evenly between those around them.
     """
     clock = bridged_ms(frames.device_ms, stray_rows(frames.device_ms, gap_ms))
     steps = np.maximum(np.diff(clock), 0)

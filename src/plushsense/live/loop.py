@@ -31,6 +31,9 @@ class LiveSummary:
         decisions_per_s: decisions per second of device time.
         restarts: number of gaps and clock resets, after which all computations restart.
         invalid: number of values outside their valid range.
+        bad_stamps: number of frames whose time was earlier than, or equal to, that of the frame before, or impossible.
+        interpolated: number of samples made up for frames that did not come, see `SampleClock`.
+        rate_hz: frames per second by the device's clock, smoothed over the newest 16; None before the first.
         counters: those of the device (frames, lost, malformed, garbage, reconnects).
         latency_ms: p50, p95 and p99 of the time from the arrival of the bytes, before they are parsed, to the decision,
             over the last hour. A replay at speed 0 delivers hundreds of frames at once, so it includes waiting.
@@ -48,6 +51,9 @@ class LiveSummary:
     decisions_per_s: float
     restarts: int
     invalid: int
+    bad_stamps: int
+    interpolated: int
+    rate_hz: float | None
     counters: dict[str, int]
     latency_ms: dict[str, float | None]
     late: int = 0
@@ -184,15 +190,18 @@ class LiveRun(Iterator[Decision]):
 
     def summary(self) -> LiveSummary:
         """Return the figures of the run so far."""
-        seconds = self.classifier.time_s
+        seconds, clock = self.classifier.time_s, self.classifier.clock
         return LiveSummary(
             self._decisions,
             self._warming,
             seconds,
             time.perf_counter() - self._begun,
             self._decisions / seconds if seconds > 0 else 0.0,
-            self.classifier.restarts,
-            self.classifier.invalid,
+            clock.restarts,
+            clock.invalid,
+            clock.bad_stamps,
+            clock.interpolated,
+            round(256_000 / clock.interval, 1) if clock.interval else None,
             self.device.counters.to_dict(),
             percentiles_ms(self.latencies_s),
             self._late,

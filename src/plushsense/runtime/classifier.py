@@ -20,6 +20,7 @@ from plushsense.runtime.events import AFFECTS, ANSWERS, KINDS, NO_GESTURE, ONE, 
 from plushsense.runtime.fixed import PROBABILITY_BITS, SMOOTH_EXTRA_BITS, smoothing_weight
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.machine import FloatLogits, LogitStream, Moment, ToyMachine
+from plushsense.windows.clock import SampleClock
 
 _DECIMALS = 4
 _SMOOTH = float(1 << (PROBABILITY_BITS + SMOOTH_EXTRA_BITS))
@@ -124,6 +125,11 @@ class StreamReader:
         self.step_s = network.arch.step * layout.period_us / 1e6
         self._machine = ToyMachine(network, layout, gestures, rules, smoothing)
         self._silent = False
+
+    @property
+    def clock(self) -> SampleClock:
+        """The clock rule on this stream, with its counts and the measured interval."""
+        return self._machine.frames.clock
 
     @property
     def restarts(self) -> int:

@@ -24,7 +24,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import Ints, integer_logits, known_score, smoothing_weight, softmax
-from plushsense.runtime.health import MOST_MS, HealthSettings
+from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.trace import trace_of
 from plushsense.scoring.events import ErrorCosts
 from plushsense.tuning.events import OTHER, MarkedStream, Truth, tune
@@ -33,8 +33,10 @@ from plushsense.windows.clock import row_times_us
 from plushsense.windows.cut import cut_windows, whole_gestures
 
 _MARGIN = 0.1  # of the range of the data
-_SAFETY = 2  # the time limits of a fault are at least this many times the longest duration in the data
+_SAFETY = 2  # fault_ms is at least this many times the longest duration in the data
+_STILL_SAFETY = 4  # and still_ms this many times
 _STILL_MS = 500
+_QUIET_SHARE = 0.1  # of the people; if more of them had a sensor still for _STILL_MS, it is one that rests at one value
 _STILL_MOST_MS = 10_000
 _INT32 = -(1 << 31), (1 << 31) - 1
 
@@ -64,15 +66,17 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettin
     between them. If such a limit is not within the valid range, touch can saturate the sensor; the limit is then one
     step inside the extreme value, because touch saturates it only for a few frames and a broken sensor permanently. If
     values beyond the limits were repeated for half of ``fault_ms``, the limits are moved to include them. ``still_ms``
-    is twice the longest time in which all channels repeated, at least 500 ms; above 10 s the rule is disabled.
+    is four times the longest time in which all channels repeated, at least 500 ms. Above 10 s the rule is disabled; so
+    it is if they repeated for 500 ms with more than a tenth of the people: at rest such quiet sensors repeat for ever.
 
     Args:
         settings: those from which ``fault_ms`` and ``recover_ms`` are taken.
     """
     settings = settings or HealthSettings()
     layout = dataset.layout
-    everything = (f for f in dataset.read_people(sorted(set(subjects))) if len(f))
-    parts = [f.take(kept_rows(f.device_ms, layout.gap_ms)) for f in everything]
+    everybody = ([f for f in dataset.read_people([subject]) if len(f)] for subject in sorted(set(subjects)))
+    people = [[f.take(kept_rows(f.device_ms, layout.gap_ms)) for f in person] for person in everybody if person]
+    parts = [f for person in people for f in person]
     if not parts:
         return HealthFit(settings, 0, 0.0, (), 0)
     values = np.concatenate([f.values for f in parts])
@@ -95,17 +99,11 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettin
             high = np.maximum(high, np.where(wrong, rows, high).max(axis=0))
     moved = (low != usual[0]) | (high != usual[1])
     widened = [name for name, other in zip(layout.names, moved.tolist(), strict=True) if other]
-    still = max(_longest(f.device_ms, _repeats(f.values, f.device_ms, layout.gap_ms)) for f in parts)
-    still_ms = max(_STILL_MS, _SAFETY * still)
-    fitted = replace(
-        settings,
-        low=tuple(low.tolist()),
-        high=tuple(high.tolist()),
-        still_ms=still_ms if still_ms <= min(_STILL_MOST_MS, MOST_MS) else 0,
-    )
+    still = [max(_longest_still(f, layout.gap_ms) for f in person) for person in people]
+    fitted = replace(settings, low=tuple(low.tolist()), high=tuple(high.tolist()), still_ms=_still_ms(still))
     steps = [np.diff(f.device_ms) for f in parts]
     passed_ms = sum(int(s[(s > 0) & (s <= layout.gap_ms)].sum()) for s in steps)
-    return HealthFit(fitted, len(values), passed_ms / 1000, tuple(widened), still)
+    return HealthFit(fitted, len(values), passed_ms / 1000, tuple(widened), max(still))
 
 
 def _runs(at: Bools) -> list[tuple[int, int]]:
@@ -122,9 +120,17 @@ def _repeats(values: NDArray[np.int64], ms: NDArray[np.int64], gap_ms: int) -> B
     return out
 
 
-def _longest(ms: NDArray[np.int64], repeats: Bools) -> int:
-    """Return the longest duration of a run of repeats, from the frame that is repeated."""
-    return max((int(ms[b] - ms[a - 1]) for a, b in _runs(repeats)), default=0)
+def _longest_still(frames: Frames, gap_ms: int) -> int:
+    """Return the longest duration in ms of a run of repeats, from the frame that is repeated."""
+    ms = frames.device_ms
+    return max((int(ms[b] - ms[a - 1]) for a, b in _runs(_repeats(frames.values, ms, gap_ms))), default=0)
+
+
+def _still_ms(longest: Sequence[int]) -> int:
+    """Return the time after which repeats are a fault, or 0 for never, given the longest time of each person."""
+    quiet = sum(ms >= _STILL_MS for ms in longest)
+    still_ms = max(_STILL_MS, _STILL_SAFETY * max(longest))
+    return 0 if quiet > _QUIET_SHARE * len(longest) or still_ms > _STILL_MOST_MS else still_ms
 
 
 def _long_wrong(

@@ -24,6 +24,7 @@ from plushsense.core.recorder_csv import (
     read_stream,
     recording_filename,
 )
+from plushsense.core.row_times import kept_rows
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
@@ -423,6 +424,18 @@ def test_two_impossible_clock_values_in_turn_are_resets(wrong: dict[int, int]) -
     clock[[*wrong]] = [*wrong.values()]
     examined = Examination(Frames(np.zeros((300, 13), dtype=np.int64), clock), PLUSH)
     assert examined.stray.tolist() == [] and [int(at) for at in examined.back[0]]
+
+
+def test_buffers_whose_stamps_overlap_are_no_resets() -> None:
+    """Of each, the windows leave out the first rows, several in turn, and read on."""
+    clock = np.concatenate([40_000 + 80 * n + 10 * np.arange(10) - 40 * (n % 2) for n in range(40)])
+    examined = Examination(Frames(np.zeros((400, 13), dtype=np.int64), clock), PLUSH)
+    kept = kept_rows(clock, PLUSH.gap_ms)
+    assert len(examined.back[0]) == 0 and np.diff(examined.stray).min() == 1
+    assert np.array_equal(examined.times[kept], clock[kept]), "only the others are moved"
+    late = 40_000 + 10 * np.arange(300)
+    late[100:104] = late[[103, 100, 101, 102]]
+    assert np.array_equal(Examination(Frames(np.zeros((300, 13), dtype=np.int64), late), PLUSH).times, late)
 
 
 def test_rows_that_came_late_are_no_reset_of_the_clock(copy: Path) -> None:

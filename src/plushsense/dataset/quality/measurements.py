@@ -116,11 +116,14 @@ class Examination:
         """Rows with an impossible time between two rows that follow each other, without those that came late."""
         clock = self.frames.device_ms
         stray = stray_rows(clock, self.layout.gap_ms)
-        return np.setdiff1d(stray, backward_steps(clock)[1] + 1) if len(stray) else stray
+        if not len(stray):
+            return stray
+        first = np.maximum.accumulate(np.where(np.diff(stray, prepend=-2) > 1, stray, 0))  # of several in turn
+        return stray[~np.isin(first, backward_steps(clock)[1] + 1)]
 
     @cached_property
     def times(self) -> NDArray[np.int64]:
-        """Device time of each row in ms, (T,), that of `stray` rows half-way between the times around them."""
+        """Device time of each row in ms, (T,), those of `stray` rows evenly between the times around them."""
         return bridged_ms(self.frames.device_ms, self.stray)
 
     @cached_property
