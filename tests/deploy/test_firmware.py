@@ -17,7 +17,7 @@ import pytest
 from plushsense.core.errors import LayoutError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Channel, Layout, load_layout
-from plushsense.dataset.readings import Readings, Rest
+from plushsense.dataset.readings import GravityReading, Readings
 from plushsense.deploy.code import facts_of
 from plushsense.deploy.golden import answers_of, column, read_golden
 from plushsense.deploy.package import (
@@ -106,7 +106,7 @@ def test_wired_sensors_arrive_in_their_channels(packages: Packages, tmp_path: Pa
 @pytest.mark.parametrize("board", BUILDS)
 def test_the_wired_sensor_gets_the_scale_of_the_training_and_another_is_noticed(tmp_path: Path, board: str) -> None:
     """The made-up sensor's readings never change; they are 1.66 times too large."""
-    rest = Rest(("x", "y", "z"), (4.0, -56.0, 42.0), 7948.0, False)
+    rest = GravityReading(("x", "y", "z"), (4.0, -56.0, 42.0), 7948.0, False)
     bundle = replace(
         bundle_of(window=60), readings=Readings((55.0, -1425.0, 4964.0), (7177.0, 6990.0, 6833.0), (rest,))
     )
@@ -129,7 +129,7 @@ def test_the_wired_sensor_gets_the_scale_of_the_training_and_another_is_noticed(
 def test_another_scale_is_noticed_at_rest_only(tmp_path: Path, c_compiler: str) -> None:
     bundle = bundle_of(window=60)
     for gravity in (7948.0, 2.0**28):
-        rest = Rest(("x", "y", "z"), (0.0, 100.0, 0.0), gravity, False)
+        rest = GravityReading(("x", "y", "z"), (0.0, 100.0, 0.0), gravity, False)
         known = replace(bundle, readings=Readings((0.0,) * 3, (1.0,) * 3, (rest,)))
         out = emit(integer_model(known), known, tmp_path / f"{gravity:g}").folder
         words = [c_compiler, "-std=c99", *WARNINGS, f"-I{out}", "-shared", "-fPIC"]

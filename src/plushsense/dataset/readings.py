@@ -17,8 +17,8 @@ _MOST = 2.0**33  # steps; values beyond it cannot come from 32-bit integers
 
 
 @dataclass(frozen=True)
-class Rest:
-    """What an accelerometer reads while it is held still.
+class GravityReading:
+    """Gravity as one accelerometer reads it: zero and 1 g of its three axes.
 
     Attributes:
         axes: names of its three channels.
@@ -43,7 +43,7 @@ class Readings:
 
     mean: tuple[float, ...]
     spread: tuple[float, ...]
-    rest: tuple[Rest, ...] = ()
+    rest: tuple[GravityReading, ...] = ()
 
     @classmethod
     def of(cls, dataset: Dataset, people: Iterable[str]) -> Readings:
@@ -76,7 +76,7 @@ class Readings:
         return ""
 
 
-def _rest(dataset: Dataset) -> Iterable[Rest]:
+def _rest(dataset: Dataset) -> Iterable[GravityReading]:
     layout = dataset.layout
     sensors = find_sensors(dataset)
     for axes in (group for group in layout.accelerometers if len(group) == 3):
@@ -86,9 +86,9 @@ def _rest(dataset: Dataset) -> Iterable[Rest]:
         if found:
             steps = [layout.channels[i].step for i in at]
             zero = [found[0].zero[name] / step for name, step in zip(axes, steps, strict=True)]
-            yield Rest(axes, _rounded(zero), _rounded([found[0].radius / steps[0]])[0], len(found) > 1)
+            yield GravityReading(axes, _rounded(zero), _rounded([found[0].radius / steps[0]])[0], len(found) > 1)
         elif length := length_at_rest(dataset, at):
-            yield Rest(axes, _rounded(layout.zero_int[at]), _rounded([length])[0], True)
+            yield GravityReading(axes, _rounded(layout.zero_int[at]), _rounded([length])[0], True)
 
 
 def _rounded(numbers: Iterable[float] | NDArray[Any]) -> tuple[float, ...]:

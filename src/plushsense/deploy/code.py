@@ -60,7 +60,7 @@ class RestFacts:
 
     ``value`` is the length of its ``channels`` in ``unit``, as lines and files have them, ``steps`` the same in the
     integers of the C, less ``zero``; ``steps`` is 0 if it is not known. ``is_estimated`` as in
-    `plushsense.dataset.readings.Rest`.
+    `plushsense.dataset.readings.GravityReading`.
     """
 
     channels: tuple[str, ...]

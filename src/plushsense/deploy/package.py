@@ -18,7 +18,7 @@ from plushsense.core.errors import BadInput, LayoutError
 from plushsense.core.files import new_folder, read_bytes
 from plushsense.core.layouts import ACCELERATION, DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.core.templates import c_comment, fill_text
-from plushsense.dataset.readings import Readings, Rest
+from plushsense.dataset.readings import GravityReading, Readings
 from plushsense.deploy.code import (
     BUNDLE,
     FACTS,
@@ -326,7 +326,7 @@ def _sources(layout: Layout, readings: Readings | None) -> list[_ChannelSource]:
     return sources
 
 
-def _motion_factor(channel: Channel, rest: Rest | None) -> tuple[str, int, str]:
+def _motion_factor(channel: Channel, rest: GravityReading | None) -> tuple[str, int, str]:
     """Return C code of the factor from sensor counts to steps of the channel, in 1/65536, the zero, and a note.
 
     The factor is "" if it cannot be computed. 1 g in steps is what was measured, else what the unit says, else what was

@@ -192,11 +192,16 @@ def build(
         command = [compiler, *machine.flags, *source_flags, *collect, *inputs, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
         if machine.emulator:
-            code, *words = machine.emulator
-            emulator = out_dir / Path(code).stem
-            _compile(["gcc", "-O2", str(RUNTIME / code), "-o", str(emulator), *words], Path(work), code)
-            machine = replace(machine, run=(str(emulator),))
+            machine = replace(machine, run=(str(_build_emulator(machine, out_dir, Path(work))),))
     return Program(machine, file, tuple(objects[: len(sources)]))
+
+
+def _build_emulator(machine: Target, out_dir: Path, work: Path) -> Path:
+    """Compile the program of this computer that runs the programs of ``machine``; return its file."""
+    code, *words = machine.emulator
+    emulator = out_dir / Path(code).stem
+    _compile(["gcc", "-O2", str(RUNTIME / code), "-o", str(emulator), *words], work, code)
+    return emulator
 
 
 def _compile_object(source: Path, compiling: Sequence[str], out: Path, work: Path) -> None:

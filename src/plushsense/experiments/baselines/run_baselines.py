@@ -33,7 +33,16 @@ from plushsense.experiments.baselines.models import (
     parse_recurrent,
     recurrent,
 )
-from plushsense.experiments.baselines.score import UNSCALED, BaselinesResult, Contender, Fit, Pca, Reader, compare
+from plushsense.experiments.baselines.score import (
+    UNSCALED,
+    BaselinesResult,
+    ComparisonResult,
+    Contender,
+    Fit,
+    Pca,
+    Reader,
+    compare,
+)
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.pool import JobsSpec
 from plushsense.jobs.study import Progress
@@ -257,9 +266,7 @@ def baselines(
         shared_rows=partial(copied_recordings, dataset, windows.recording_ids),
         progress=progress,
     )
-    for split in compared.splits:
-        if not split.leaky:
-            warn_of_copies(split.leakage, warn)
+    _warn_of_leaks(compared, warn)
     result = BaselinesResult(
         **vars(compared),
         dataset=dataset.head.name,
@@ -276,6 +283,13 @@ def baselines(
         with dataset.generation.writing():
             save_baselines(result, Path(out))
     return result
+
+
+def _warn_of_leaks(compared: ComparisonResult, warn: Warn) -> None:
+    """Warn of copies on both sides of a split that is not leaky anyway."""
+    for split in compared.splits:
+        if not split.leaky:
+            warn_of_copies(split.leakage, warn)
 
 
 def _require_reports() -> None:

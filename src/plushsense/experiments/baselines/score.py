@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
@@ -249,13 +249,9 @@ def compare(
     def summarise(study: StudyResults) -> ComparisonResult:
         together = itertools.groupby(study.done, key=lambda done: (done[0].task.contender, done[0].task.split))
         rows = tuple(_row(windows, list(done)) for _, done in together)
-        shared = shared_rows()
         return ComparisonResult(
             context_of(windows),
-            tuple(
-                SplitFolds(split.text, split.leaky, len(made), audit_leakage(windows, windows, made, shared))
-                for split, made in folds.items()
-            ),
+            _audited(windows, folds, shared_rows()),
             len(windows),
             len(np.unique(windows.recording)),
             len(set(windows.subject.tolist()) - {NOBODY}),
@@ -269,6 +265,16 @@ def compare(
 
     key = {"version": _VERSION, "windows": windows_fingerprint(windows), "rate_hz": windows.rate_hz}
     return run_study(parts, _work, summarise, key=key, shared=windows, spec=spec, progress=progress)
+
+
+def _audited(
+    windows: WindowSet, folds: Mapping[Split, Sequence[Fold]], shared_rows: Collection[tuple[str, str]]
+) -> tuple[SplitFolds, ...]:
+    """Return each split with the leakage audit of its folds."""
+    return tuple(
+        SplitFolds(split.text, split.leaky, len(made), audit_leakage(windows, windows, made, shared_rows))
+        for split, made in folds.items()
+    )
 
 
 def gaps(rows: Sequence[ProgramScores]) -> tuple[ProgramGap, ...]:

@@ -366,7 +366,7 @@ def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
     return rows
 
 
-def trial_settings(row: ResultRow) -> dict[str, Any]:
+def trial_settings(row: ResultRow) -> dict[str, object]:
     """Return the settings with which a trial of a sweep or search was trained, for another training.
 
     Raises:
