@@ -92,6 +92,16 @@ def test_the_networks_of_the_issue_stay_within_their_limits(
     assert all(e.fits == "yes" for e in found.estimates.values())
 
 
+@pytest.mark.parametrize(("target", "optimise", "most"), [("cortex-m0", "-Os", 1.65), ("xtensa", "-Og", 1.75)])
+def test_a_build_for_size_or_for_debugging_is_not_far_slower(
+    target: str, optimise: str, most: float, small: Path, target_here: Here
+) -> None:
+    """The Arduino IDE compiles for size, and ESP-IDF projects for debugging, unless somebody chooses otherwise."""
+    facts = read_facts(small)
+    slow, fast = (count(small, target_here(target), facts, o).stages["network"] for o in (optimise, "-O2"))
+    assert fast <= slow < most * fast
+
+
 def test_a_heap_and_floating_point_are_found(own: Path, target_here: Here) -> None:
     target = target_here("xtensa")
     source = own / "plushsense.c"

@@ -136,7 +136,8 @@ static uint32_t le32(const uint8_t *p)
 
 /* The same at a multiple of 4. */
 #if defined(__GNUC__) && defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__
-static uint32_t aligned_le32(const uint8_t *p)
+__attribute__((always_inline)) /* also where one debugs */
+static inline uint32_t aligned_le32(const uint8_t *p)
 {
     uint32_t v;
 
@@ -168,6 +169,14 @@ static int32_t shift_down(int32_t v, uint32_t n)
 {
     return v >= 0 ? v >> n : ~(~v >> n);
 }
+
+/* The same of a word in two's complement: GCC says that it keeps the bits and shifts the sign in, and where it inlines
+ * nothing (-Og) the functions would take most of the time. */
+#ifdef __GNUC__
+#define PLUSH_DOWN(v, n) ((uint32_t)((int32_t)(v) >> (n)))
+#else
+#define PLUSH_DOWN(v, n) bits_of(shift_down(as_signed(v), n))
+#endif
 
 static int32_t within(int32_t v, int32_t low, int32_t high)
 {
@@ -841,8 +850,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
  * for which small cores have too few registers. (clang gives no number of 32 bits to a register of AVR.) */
 #if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__) && defined(__OPTIMIZE__)
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
+#ifndef __OPTIMIZE_SIZE__ /* for which gcc keeps nothing in the high registers */
 /* Eight registers multiply, and the others can be added to. */
 #define PLUSH_ADD(s, v) __asm__ volatile("add %0, %1" : "+h"(s) : "l"(v))
+#endif
 #define PLUSH_NEXT_WORD(v) __asm__ volatile("ldmia %0!, {%1}" : "+l"(w), "=l"(v) : : "memory")
 #elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__) && !(defined(__AVR__) && defined(__clang__))
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
@@ -855,6 +866,8 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         (s) += (v);     \
         PLUSH_KEEP(s);  \
     } while (0)
+#endif
+#ifndef PLUSH_NEXT_WORD
 #define PLUSH_NEXT_WORD(v) ((v) = aligned_le32(w), w += 4)
 #endif
 #ifdef __AVR__
@@ -878,7 +891,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         w += 4;                                   \
     } while (0)
 #else
-#define PLUSH_HIGH(v) bits_of(shift_down(as_signed(v), 16))
+#define PLUSH_HIGH(v) PLUSH_DOWN(v, 16)
 #define PLUSH_CHANNEL(i)            \
     do {                            \
         uint32_t v, a = x[i], p;    \
@@ -1096,10 +1109,10 @@ static void activations(uint32_t sum[GROUP], uint32_t extra, const uint8_t *scal
     uint32_t b = sum[1] - extra, c = sum[2] - extra * 257u, a = sum[0] - extra * UINT32_C(0x10101);
 #endif
 
-    sum[0] = bits_of(shift_down(as_signed((a - (c << 8)) << 8), 8));
-    sum[1] = bits_of(shift_down(as_signed(a - (b << 16) - sum[0]), 8));
-    sum[2] = bits_of(shift_down(as_signed(c - sum[1]), 8));
-    sum[3] = bits_of(shift_down(as_signed(b - sum[2]), 8));
+    sum[0] = PLUSH_DOWN((a - (c << 8)) << 8, 8);
+    sum[1] = PLUSH_DOWN(a - (b << 16) - sum[0], 8);
+    sum[2] = PLUSH_DOWN(c - sum[1], 8);
+    sum[3] = PLUSH_DOWN(b - sum[2], 8);
 #endif
     for (; n > 0; n--, scale += SCALE_BYTES)
         *out++ = (uint8_t)requantize(as_signed(*sum++ + aligned_le32(scale)), aligned_le32(scale + 4) & 0xffffu, scale[6],
