@@ -68,7 +68,9 @@ def test_sessions_that_lie_there(tmp_path: Path) -> None:
         assert shown[-1].file == recorder.status().file
         assert all(s.file and not s.skipped and s.discarded == 0 for s in shown)
         status = recorder.status()
-        assert (status.frames, status.bad_share_total, status.bad_share) == (status.rows, 0.0, 0.0)
+        # Frames that the toy sends between the last step and this line are counted as well.
+        assert status.frames >= status.rows > 0
+        assert (status.bad_share_total, status.bad_share) == (0.0, 0.0)
         assert replace(status, lost=6, malformed=3, garbage=1, frames=90).bad_share_total == 0.1
         assert replace(status, frames=0).bad_share_total == 0.0
         # What a command may be given upon changes with whatever the command would mean.
