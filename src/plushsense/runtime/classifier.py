@@ -179,7 +179,7 @@ class StreamReader:
         frame = whole_frame(frame, self.layout)
         decisions = [
             self._decision(moment)
-            for moment in self._machine.push(frame.device_ms, frame.values)
+            for moment in self._machine.push(frame.device_ms, frame.values, frame.host_ms)
             if not (self._silent and moment.cause == "no signal")  # `silence` has reported it already
         ]
         if self._machine.frames.clock.left_out:
