@@ -173,8 +173,8 @@ class SampleClock:
             self._follows = not self.left_out
         if not self.left_out:
             seen_ms = self._seen_host_ms
-            known = self.restarted and host_ms is not None and seen_ms is not None
-            self.rebooted = known and bool(_over_reboot(step // 1000, host_ms - seen_ms))
+            pause_ms = 0 if host_ms is None or seen_ms is None else host_ms - seen_ms
+            self.rebooted = self.restarted and bool(_over_reboot(step // 1000, pause_ms))
             self._seen_us, self._seen_host_ms = time, host_ms
         return not self.left_out
 
