@@ -139,13 +139,17 @@ def test_the_past_of_the_session_is_used_and_nothing_else(tmp_path: Path) -> Non
 DAY_MS = 24 * 3_600_000
 
 
-def over_a_boundary(device_step_ms: int, host_step_ms: int, after_ms: int = 0) -> tuple[Frames, int]:
-    """Frames of a sensor with another gain and offset, and of the usual one after a boundary, at the row returned."""
+def over_a_boundary(device_step_ms: int, host_step_ms: int, stale: int) -> tuple[Frames, int]:
+    """Frames of a sensor with another gain and offset, and of the usual one after a boundary, at the row returned.
+
+    The last ``stale`` frames of the other one come after the pause.
+    """
     other, own = frames(np.rint(readings(3000, 8) * 0.2 + 9000).astype(np.int64)), frames(readings(1500, 9))
     device = own.device_ms + other.device_ms[-1] + device_step_ms
     assert other.host_ms is not None
     values, clock = np.concatenate([other.values, own.values]), np.concatenate([other.device_ms, device])
     host = np.concatenate([other.host_ms, own.device_ms + other.host_ms[-1] + host_step_ms])
+    host[len(other) - stale : len(other)] += host_step_ms
     return Frames(values, clock, host), len(other)
 
 
@@ -157,20 +161,21 @@ def gravity_error(inputs: NDArray[np.int64], wanted: NDArray[np.int64]) -> float
 
 
 @pytest.mark.parametrize(
-    ("boundary", "device_step_ms", "host_step_ms", "anew"),
+    ("boundary", "device_step_ms", "host_step_ms", "stale", "anew"),
     [
-        ("a reboot and a pause of 17 hours", -25_000, 17 * 3_600_000, True),
-        ("a clock that had gone on from a reboot that nobody read", 60_000, DAY_MS, True),
-        ("a pause on both clocks", DAY_MS, DAY_MS, False),
-        ("a reset of the clock alone", -25_000, 300, False),
-        ("a reset with a short pause", -25_000, 120_000, False),
+        ("a reboot and a pause of 17 hours", -25_000, 17 * 3_600_000, 0, True),
+        ("frames that the driver had kept from before the pause", -25_000, 17 * 3_600_000, 70, True),
+        ("a clock that had gone on from a reboot that nobody read", 60_000, DAY_MS, 0, True),
+        ("a pause on both clocks", DAY_MS, DAY_MS, 0, False),
+        ("a reset of the clock alone", -25_000, 300, 0, False),
+        ("a reset with a short pause", -25_000, 120_000, 0, False),
     ],
 )
 def test_a_reboot_with_a_long_pause_begins_anew(
-    boundary: str, device_step_ms: int, host_step_ms: int, anew: bool, tmp_path: Path
+    boundary: str, device_step_ms: int, host_step_ms: int, stale: int, anew: bool, tmp_path: Path
 ) -> None:
     layout = replace(LAYOUT, inputs=("x", "y", "z")).for_vectors()
-    whole, at = over_a_boundary(device_step_ms, host_step_ms)
+    whole, at = over_a_boundary(device_step_ms, host_step_ms, stale)
     folder = tmp_path / "src" / "ana"
     folder.mkdir(parents=True)
     (folder / "fulldatastream.csv").write_text(format_rows(whole, PLAIN))

@@ -101,7 +101,7 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthSetting
     step_ms = np.diff(frames.device_ms, prepend=frames.device_ms[:1])
     begins = (step_ms < 0) | (step_ms > layout.gap_ms)
     begins[1:] |= fault[1:] != fault[:-1]
-    rebooted, calibration = reboots(frames, layout.gap_ms), SelfCalibration(layout)
+    rebooted, calibration = reboots(frames.device_ms, frames.host_ms, layout.gap_ms), SelfCalibration(layout)
     edges = [0, *np.flatnonzero(begins).tolist(), len(times)]
     parts: list[Part] = []
     for first, last in pairwise(edges):

@@ -13,11 +13,12 @@ A whole recording, a live stream and a toy's chip get identical samples, since a
    computed when the first frame at or after its time arrives, by linear interpolation between the two frames around
    it, rounded half up: ``x0 + floor((2 (x1 - x0) (t - t0) + (t1 - t0)) / (2 (t1 - t0)))``. Of several frames with
    equal times, the first ends the interval before them, and the last starts the interval after them.
-4. A new segment begins after a *reboot* if, since the last frame that was not left out, the clock of the host went on
-   by `LONG_PAUSE_MS` or more, and that of the device by less than half of it, or back: the device was off, and may have
-   another sensor now. All that is known of its sensors (`plushsense.windows.self_calibration`) is then forgotten, too;
-   a gap, or a clock that was reset without such a pause, leaves it as it is. Frames without a clock of the host, as on
-   a chip, show no reboot: ``plush_recalibrate`` tells the C of one.
+4. A new segment of rule 1 begins after a *reboot* if, since the frame `STALE_FRAMES` before, of those not left out, the
+   clock of the host went on by `LONG_PAUSE_MS` or more, and that of the device by less than half of it, or back: the
+   device was off, and may have another sensor now. After a pause, drivers may first give frames that they had kept from
+   before it. All that is known of the sensors (`plushsense.windows.self_calibration`) is then forgotten, too; a gap, or
+   a clock that was reset without such a pause, leaves it as it is. Frames without a clock of the host, as on a chip,
+   show no reboot: ``plush_recalibrate`` tells the C of one.
 
 For a live stream the clock also measures the interval between the frames, as a toy does.
 """
@@ -25,6 +26,7 @@ For a live stream the clock also measures the interval between the frames, as a 
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,6 +40,8 @@ from plushsense.core.row_times import kept_rows
 
 LONG_PAUSE_MS = 600_000
 """Duration after which another sensor is likely; ``docs/people.md`` has the measurement."""
+STALE_FRAMES = 256
+"""Number of frames that a driver may keep over a pause: more than fit into 4 KiB."""
 _MOST_INTERVAL = (1 << 16) - 1
 
 
@@ -71,12 +75,13 @@ def is_reboot(before: Frames, after: Frames) -> bool:
     return bool(_over_reboot(*steps))
 
 
-def reboots(frames: Frames, gap_ms: float) -> NDArray[np.bool_]:
+def reboots(device_ms: NDArray[np.int64], host_ms: NDArray[np.int64] | None, gap_ms: float) -> NDArray[np.bool_]:
     """Return which frames (T,), of those that rule 1 keeps, are the first after a reboot."""
-    if frames.host_ms is None:
-        return np.zeros(len(frames), dtype=np.bool_)
-    step, host_step = (np.diff(clock, prepend=clock[:1]) for clock in (frames.device_ms, frames.host_ms))
-    return np.asarray(((step < 0) | (step > gap_ms)) & _over_reboot(step, host_step))
+    if host_ms is None:
+        return np.zeros(len(device_ms), dtype=np.bool_)
+    step, before = np.diff(device_ms, prepend=device_ms[:1]), np.maximum(np.arange(len(device_ms)) - STALE_FRAMES, 0)
+    steps = (clock - clock[before] for clock in (device_ms, host_ms))
+    return np.asarray(((step < 0) | (step > gap_ms)) & _over_reboot(*steps))
 
 
 def _over_reboot(step_ms: Any, host_step_ms: Any) -> Any:
@@ -137,7 +142,7 @@ class SampleClock:
     def restart(self) -> None:
         """Start a new segment with the next frame, whatever its time."""
         self._seen_us, self._follows = None, False
-        self._seen_host_ms: int | None = None
+        self._recent = deque[tuple[int, int]](maxlen=STALE_FRAMES)  # device and host time of the newest frames
         self.forget()
 
     def forget(self) -> None:
@@ -172,10 +177,12 @@ class SampleClock:
         if not late:
             self._follows = not self.left_out
         if not self.left_out:
-            seen_ms = self._seen_host_ms
-            pause_ms = 0 if host_ms is None or seen_ms is None else host_ms - seen_ms
-            self.rebooted = self.restarted and bool(_over_reboot(step // 1000, pause_ms))
-            self._seen_us, self._seen_host_ms = time, host_ms
+            self._seen_us, self.rebooted = time, False
+            if host_ms is not None:
+                if self.restarted and self._recent:
+                    before, host_before = self._recent[0]
+                    self.rebooted = bool(_over_reboot(int(device_ms) - before, host_ms - host_before))
+                self._recent.append((int(device_ms), host_ms))
         return not self.left_out
 
     def count_from(self, other: SampleClock) -> None:
@@ -239,7 +246,8 @@ def resample(frames: Frames, layout: Layout) -> list[Segment]:
     step = np.diff(time)
     breaks = np.flatnonzero((step < 0) | (step > layout.gap_ms * 1000)) + 1
     edges = [0, *breaks.tolist(), len(time)]
-    rebooted = reboots(frames.take(rows), layout.gap_ms)
+    host_ms = None if frames.host_ms is None else frames.host_ms[rows]
+    rebooted = reboots(frames.device_ms[rows], host_ms, layout.gap_ms)
     segments, forgets = [], False
     for first, last in itertools.pairwise(edges):
         segment = _segment(time[first:last], values[first:last], layout, rows[first:last])
