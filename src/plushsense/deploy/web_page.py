@@ -66,7 +66,7 @@ def page_settings(bundle: Bundle, facts: ModelFacts) -> Mapping[str, object]:
             "csv": {name: getattr(layout.csv, name) for name in ("columns", "header", "separator")},
         },
         "wires": [other.wire for other in known if other.channels == layout.channels and other.wire != layout.wire],
-        "gestures": [gesture.label for gesture in bundle.gestures.gestures],
+        "gestures": [{"label": g.label, "affect": g.affect} for g in bundle.gestures.gestures],
         "reactions": {name: load_reactions(name).to_dict()["reactions"] for name in reaction_names()},
     }
 

@@ -9,7 +9,7 @@ const layout = settings.layout, channels = layout.channels, period = 1000 / layo
 // Words: the English text is the key ------------------------------------------------------------------------------------
 const LATVIAN = {
   "Toy": "Rotaļlieta", "Connect by cable": "Savienot ar kabeli", "Connect by Bluetooth": "Savienot ar Bluetooth", "Play a recording": "Atskaņot ierakstu",
-  "Stop": "Apturēt", "Reactions": "Reakcijas", "green, or red if rough": "zaļas, rupjam pieskārienam sarkanas", "green, or dark if rough": "zaļas, rupjam pieskārienam tumšas", "none at all": "nekādu", "These data are simulated": "Šie dati ir simulēti", "Now": "Tagad", "Events": "Notikumi", "Save the log": "Saglabāt žurnālu",
+  "Stop": "Apturēt", "Reactions": "Reakcijas", "green, or red if rough": "zaļas; ja rupji, sarkanas", "green, or dark if rough": "zaļas; ja rupji, tumšas", "none at all": "nekādu", "These data are simulated": "Šie dati ir simulēti", "Now": "Tagad", "Events": "Notikumi", "Save the log": "Saglabāt žurnālu",
   "Probabilities": "Varbūtības", "Signals": "Signāli", "Record frames": "Ierakstīt kadrus", "Gesture": "Žests", "Begin": "Sākt", "End and save": "Beigt un saglabāt",
   "The toy does not react to these numbers, but to the events, which are decided from them over some time.": "Rotaļlieta reaģē nevis uz šiem skaitļiem, bet uz notikumiem, par kuriem no tiem izlemj ilgākā laikā.",
   "The file stays on this computer. Put the files of one person into one folder; plushsense import reads them.": "Datne paliek šajā datorā. Viena cilvēka datnes lieciet vienā mapē; plushsense import tās nolasa.",
@@ -541,12 +541,14 @@ function drawSignals(now) {
   const oldest = ring.s[(ring.n - 1) % KEPT] - SHOWN_S * 0.98;
   for (let i = 0; i < channels.length && ranges[i]; i++) {
     const [low, top] = ranges[i];
+    let pen = false;
     for (let k = first; k < ring.n; k++) {
       if (ring.s[k % KEPT] < oldest) continue;
       const at = x(k), y = lane * (i + 1) - 3 - ((ring.y[i][k % KEPT] - low) / (top - low)) * (lane - 6);
       // A gap in the clock of the toy is a gap in the line.
-      if (k === first || at < x(k - 1) || ring.s[k % KEPT] - ring.s[(k - 1) % KEPT] > 0.3) c.moveTo(at, y);
+      if (!pen || at < x(k - 1) || ring.s[k % KEPT] - ring.s[(k - 1) % KEPT] > 0.3) c.moveTo(at, y);
       else c.lineTo(at, y);
+      pen = true;
     }
   }
   c.stroke();
@@ -563,7 +565,7 @@ function speakLanguage(chosen) {
   say("without", hints.filter(Boolean).map((text) => t(text)).join(" "));
   $("canvas").setAttribute("aria-label", t("The signals of the toy over the last {s} seconds, one lane each", { s: SHOWN_S }));
   $("lanes").replaceChildren(...channels.map((c) => make("li", t(c.name))));
-  $("bars").replaceChildren(...settings.gestures.map((label) => {
+  $("bars").replaceChildren(...settings.gestures.map(({ label }) => {
     const li = make("li"), bar = make("i");
     bar.append(make("b"));
     bar.ariaHidden = "true";
@@ -571,7 +573,7 @@ function speakLanguage(chosen) {
     return li;
   }));
   const picked = $("gesture").selectedIndex;
-  $("gesture").replaceChildren(...settings.gestures.map((label) => make("option", named(label), { value: label })));
+  $("gesture").replaceChildren(...settings.gestures.map(({ label }) => make("option", named(label), { value: label })));
   $("gesture").selectedIndex = Math.max(0, picked);
   if (rows) $("record").textContent = t("End and save");
   redraw();
