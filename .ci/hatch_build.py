@@ -10,7 +10,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
-class Modules(BuildHookInterface[Any]):
+class Modules(BuildHookInterface):
     """Compile both modules; an editable installation compiles them when it exports."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
