@@ -47,7 +47,7 @@ def web_files(bundle: Bundle, facts: ModelFacts, image: bytes, module: bytes | N
 
 def _page(bundle: Bundle, facts: ModelFacts, image: bytes, module: bytes) -> str:
     library, page, style = ((WEB / name).read_text("utf-8") for name in ("plushsense.js", "page.js", "page.css"))
-    code = "\n" + re.sub(r"^export (?=\w)", "", library, flags=re.M) + page
+    code = "\n" + re.sub(r"^ */\*\*.*?\*/\n|^export (?=\w)", "", library + page, flags=re.M | re.S)
     style = "\n" + style
     scripts, styles = (f"'sha256-{_base64(sha256(text.encode()).digest())}'" for text in (code, style))
     return fill_text(
