@@ -91,13 +91,10 @@ class LineParser {
   }
 
   keep(piece) {
-    if (this.skipping) return;
-    this.pending += piece;
+    if (!this.skipping) this.pending += piece;
     if (this.pending.length <= this.longest) return;
-    this.malformed++;
-    this.note(this.pending);
-    this.pending = "";
-    this.skipping = true;
+    this.refuse(this.pending);
+    [this.pending, this.skipping] = ["", true];
   }
 
   take() {
@@ -106,12 +103,7 @@ class LineParser {
     const fields = line.split(/[ ,;\t]+/).filter(Boolean);
     if (skipped || !fields.length) return null;
     const numbers = this.numbers(fields);
-    if (!numbers) {
-      this.malformed++;
-      if (!joined) this.note(line);
-      this.other(fields);
-      return null;
-    }
+    if (!numbers) return this.refuse(joined ? "" : line, fields);
     this.unreadable = this.others = 0;
     if (joined) return null;
     let ms = numbers[this.clockAt];
@@ -125,15 +117,14 @@ class LineParser {
     return { ms, values };
   }
 
-  note(line) {
-    if (!this.unreadable++) this.unread = line.slice(0, 100).replace(/[^ -~]/g, "?");
-  }
-
-  /** Older firmware of the same toy, by the number of its numbers: read it from here on. */
-  other(fields) {
+  /** Count a malformed line. Ten of another number of numbers are of older firmware of the toy: read it from here on. */
+  refuse(line, fields = []) {
+    this.malformed++;
+    if (line && !this.unreadable++) this.unread = line.slice(0, 100).replace(/[^ -~]/g, "?");
     const fits = settings.wires.find((wire) => wire.length === fields.length && wire.length !== this.wire.length);
     this.others = fits && fields.every((field) => DECIMAL.test(field)) ? this.others + 1 : 0;
     if (this.others >= 10 && !this.frames) this.use(fits);
+    return null;
   }
 
   numbers(fields) {
@@ -251,7 +242,8 @@ async function begin(source) {
   toy.onEvent = (event) => change(own, event);
   run = own;
   ring.n = 0;
-  $("stop").disabled = $("log").disabled = $("record").disabled = false;
+  for (const id of ["stop", "log", "record"]) $(id).disabled = false;
+  document.body.classList.add("running"); // hides what connects
   say("message", source.file ? t("Playing “{file}”, a recording.", source) : t("Reading the toy."));
   dispatchEvent(new CustomEvent("plushsense", { detail: own }));
   navigator.wakeLock?.request("screen").catch(() => {});
@@ -264,7 +256,8 @@ async function stop(sentence = "") {
   if (!old || old.over) return;
   old.over = true;
   old.toy.silence(); // ends what is going on
-  $("stop").disabled = true;
+  $("stop").disabled = $("record").disabled = true;
+  document.body.classList.remove("running");
   if (rows) record();
   say("message", sentence);
   redraw();
@@ -424,7 +417,8 @@ function record() {
 const SIGNS = { positive: "+", neutral: "○", negative: "−", none: "·" };
 const say = (id, text) => { if ($(id).textContent !== text) $(id).textContent = text; };
 const make = (tag, text = "", values = {}) => Object.assign(document.createElement(tag), { textContent: text }, values);
-let frame = 0, textAt = 0, listed = false, drawn = 0, ranges = [], rangedAt = 0, spoken = null, speaking = 0;
+const LANE = 44, ink = {};
+let pen = null, frame = 0, textAt = 0, listed = false, drawn = 0, ranges = [], rangedAt = 0, spoken = null, speaking = 0, told = 0;
 
 /** At most one sentence in 2.5 seconds, always the newest. */
 function speak(text) {
@@ -467,14 +461,14 @@ function showTexts() {
     li.lastChild.textContent = percent === null ? "–" : `${percent} %`;
   }
   if (rows) say("rows", t("{n} frames", { n: rows.length }));
-  if (run) {
+  if (run && ++told % 4 === 0) {
     const n = run.toy.counts();
     say("counts", t("Frames: {frames}. Unreadable lines: {bad}. Invalid values: {invalid}. Gaps: {gaps}.", { frames: run.frames, bad: run.parser.malformed, invalid: n.invalid, gaps: n.restarts }));
   }
   const marks = [$("simulated").checked && "Simulation: these data say nothing about a real toy.", settings.simulated && "Simulation: this network was trained on virtual people. What it says about a real toy proves nothing."];
   say("mark", marks.filter(Boolean).map((text) => t(text)).join(" "));
   $("mark").hidden = !$("mark").textContent;
-  if (!listed || run?.spans.at(-1)?.to === null) showEvents();
+  if (!listed) showEvents();
 }
 
 function showEvents() {
@@ -489,12 +483,12 @@ function showEvents() {
   }));
 }
 
-/** Draw with the next frame of the screen: the signals each time, texts ten times a second. */
+/** Draw with the next frame of the screen: the signals each time, texts four times a second and with each event. */
 function draw() {
   frame ||= requestAnimationFrame((now) => {
     frame = 0;
     drawSignals(now);
-    if (now - textAt < 100) return;
+    if (listed && now - textAt < 250) return;
     textAt = now;
     showTexts();
   });
@@ -502,57 +496,53 @@ function draw() {
 setInterval(draw, 500); // what frames no longer change
 
 function redraw() {
-  ranges = [];
-  drawn = textAt = 0;
-  listed = false;
+  for (const name of ["back", "trace"]) ink[name] = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+  [ranges, drawn, told, listed] = [[], 0, 3, false];
   draw();
 }
 
 /** New samples are drawn over the oldest ones, from left to right: that costs less than to move the picture. */
 function drawSignals(now) {
-  const canvas = $("canvas"), ratio = devicePixelRatio || 1, lane = 44, wide = canvas.clientWidth, high = lane * channels.length;
-  if (canvas.width !== Math.round(wide * ratio) || canvas.height !== Math.round(high * ratio) || ring.n < drawn) {
-    Object.assign(canvas, { width: Math.round(wide * ratio), height: Math.round(high * ratio) });
+  const canvas = $("canvas"), ratio = devicePixelRatio || 1, [wide, high] = [canvas.clientWidth, LANE * channels.length];
+  if (canvas.width !== Math.round(wide * ratio) || canvas.height !== Math.round(high * ratio)) {
+    [canvas.width, canvas.height, drawn] = [Math.round(wide * ratio), Math.round(high * ratio), 0];
     canvas.style.height = `${high}px`;
-    [drawn, ranges] = [0, []];
   }
-  const c = canvas.getContext("2d"), colour = getComputedStyle(document.documentElement), from = Math.max(0, ring.n - KEPT);
-  if (ranges.length === 0 || now - rangedAt > 1000) {
-    rangedAt = now;
-    // Many times the noise, so that a lane at rest is flat; wider as soon, narrower only when the signal has long been small.
-    for (const [i, y] of ring.y.entries()) {
-      let [low, top, moved] = [Infinity, -Infinity, 0];
-      for (let k = from; k < ring.n; k++) {
-        const v = y[k % KEPT];
-        [low, top] = [Math.min(low, v), Math.max(top, v)];
-        if (k > from) moved += Math.abs(v - y[(k - 1) % KEPT]);
-      }
-      const room = Math.max(4, (10 * moved) / Math.max(1, ring.n - from), 0.55 * (top - low)), middle = (low + top) / 2, old = ranges[i];
-      if (ring.n && (!old || low < old[0] || top > old[1] || old[1] - old[0] > 6 * room)) [ranges[i], drawn] = [[middle - room, middle + room], 0];
-    }
-  }
-  const first = Math.max(from, drawn - 1), x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
+  const from = Math.max(0, ring.n - KEPT, ring.n - Math.ceil(0.98 * SHOWN_S * layout.rate_hz));
+  if (!drawn || now - rangedAt > 1000) setRanges(from, now);
+  if (ring.n === drawn) return;
+  const c = (pen ??= canvas.getContext("2d", { alpha: false })), first = Math.max(from, drawn - 1), x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
-  if (!drawn) c.clearRect(0, 0, wide, high);
-  if (ring.n - first < 2) return;
-  c.strokeStyle = colour.getPropertyValue("--trace");
+  c.fillStyle = ink.back;
+  c.strokeStyle = ink.trace;
+  if (!drawn) c.fillRect(0, 0, wide, high);
+  else c.fillRect(x(first) + 1, 0, Math.max(x(ring.n - 1) - x(first), 0) + 16, high);
   c.beginPath();
-  for (let k = first; k < ring.n; k++) if (k > first && drawn) c.clearRect(x(k - 1) + 1, 0, Math.max(x(k) - x(k - 1), 0) + 16, high);
-  const oldest = ring.s[(ring.n - 1) % KEPT] - SHOWN_S * 0.98;
-  for (let i = 0; i < channels.length && ranges[i]; i++) {
-    const [low, top] = ranges[i];
-    let pen = false;
+  for (let i = 0; i < channels.length; i++) {
+    const [low, top] = ranges[i], values = ring.y[i];
     for (let k = first; k < ring.n; k++) {
-      if (ring.s[k % KEPT] < oldest) continue;
-      const at = x(k), y = lane * (i + 1) - 3 - ((ring.y[i][k % KEPT] - low) / (top - low)) * (lane - 6);
+      const at = x(k), y = LANE * (i + 1) - 3 - ((values[k % KEPT] - low) / (top - low)) * (LANE - 6);
       // A gap in the clock of the toy is a gap in the line.
-      if (!pen || at < x(k - 1) || ring.s[k % KEPT] - ring.s[(k - 1) % KEPT] > 0.3) c.moveTo(at, y);
+      if (k === first || at < x(k - 1) || ring.s[k % KEPT] - ring.s[(k - 1) % KEPT] > 0.3) c.moveTo(at, y);
       else c.lineTo(at, y);
-      pen = true;
     }
   }
   c.stroke();
   drawn = ring.n;
+}
+
+/** A lane shows many times its noise, so that it is flat at rest; it widens at once, and narrows when its signal has long been small. */
+function setRanges(from, now) {
+  rangedAt = now;
+  for (const [i, y] of ring.y.entries()) {
+    let [low, top, moved] = [Infinity, -Infinity, 0];
+    for (let k = from; k < ring.n; k++) {
+      const v = y[k % KEPT];
+      [low, top, moved] = [Math.min(low, v), Math.max(top, v), moved + (k > from ? Math.abs(v - y[(k - 1) % KEPT]) : 0)];
+    }
+    const room = Math.max(4, (10 * moved) / Math.max(1, ring.n - from), 0.55 * (top - low)), old = ranges[i];
+    if (!old || low < old[0] || top > old[1] || old[1] - old[0] > 6 * room) [ranges[i], drawn] = [[(low + top) / 2 - room, (low + top) / 2 + room], 0];
+  }
 }
 
 function speakLanguage(chosen) {
