@@ -302,6 +302,11 @@ export class Toy {
     };
   }
 
+  /** @returns {number} bytes of the module's memory, which does not grow while a toy runs */
+  get bytes() {
+    return this._c.memory.buffer.byteLength;
+  }
+
   silence() {
     this._c.plush_silence(this._toy);
   }
