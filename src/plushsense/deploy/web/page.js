@@ -584,5 +584,5 @@ for (const node of document.querySelectorAll("[data-language]")) node.addEventLi
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 addEventListener("resize", draw);
 say("model", settings.title);
-window.plushPage = { LineParser, readFile, begin, take, stop };
+window.plushPage = { LineParser, readFile, named, t, get run() { return run; } };
 speakLanguage(language);
