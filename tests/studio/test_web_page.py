@@ -30,8 +30,8 @@ from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import IntegerClassifier
 from plushsense.runtime.image import IntegerModel
 from plushsense.studio.app.words import Words
-from support.browsing import PHONE, Look, axe, english
-from support.exports import bundle_of
+from support.browsing import PHONE, Look, Studio, axe, english, marked
+from support.exports import bundle_of, exported
 from support.requirements import LONG
 from support.sent_lines import format_line
 
@@ -302,6 +302,33 @@ def test_a_browser_without_ports_says_what_to_do_and_the_page_cannot_ask_for_any
     assert opened.page.evaluate(blocked) == "connect-src"
     assert all("Content Security Policy" in text for text in opened.look.complaints)
     opened.look.complaints.clear()
+
+
+def test_the_studio_opens_and_saves_the_page_of_an_export(
+    studio: Callable[..., Studio], look: Callable[..., Look], home: Path, trained: Bundle
+) -> None:
+    exported(home / "exports" / "bear", trained)
+    file = home / "exports" / "bear" / PAGE
+    url = studio(home=home).url
+    looking = look()
+    page = looking.open(f"{url}/export?name=bear")
+    with page.expect_popup() as opened:
+        marked(page, "open-page").click()
+    opened.value.wait_for_function("() => document.getElementById('state').textContent === 'Not started'")
+    assert axe(opened.value) == []
+    opened.value.close()
+    with page.expect_download() as saved:
+        marked(page, "save-page").click()
+    assert saved.value.suggested_filename == "bear.html"
+    assert Path(saved.value.path()).read_bytes() == file.read_bytes()
+    assert looking.complaints == []
+    # Of a page from elsewhere no script runs, though it claims the policy.
+    file.write_text(file.read_text("utf-8") + "<script>document.title = 'theirs'</script>", "utf-8")
+    page.goto(f"{url}/page/bear")
+    assert page.title() == "PlushSense" and "Content Security Policy" in looking.complaints.pop()
+    file.write_text("another version", "utf-8")
+    for name in ("bear", "none", "..%2Fbear", "a" * 300):
+        assert page.request.get(f"{url}/page/{name}").status == 404
 
 
 @pytest.mark.exhaustive

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import dataclass
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -47,19 +48,30 @@ def web_files(bundle: Bundle, facts: ModelFacts, image: bytes, module: bytes | N
     return files
 
 
-def _page(bundle: Bundle, facts: ModelFacts, image: bytes, module: bytes) -> str:
+def page_policy() -> str:
+    """Return the Content-Security-Policy of the page of this version: its own script and style, and no request."""
+    scripts, styles = (f"'sha256-{_base64(sha256(text.encode()).digest())}'" for text in _code_and_style())
+    # No address at all: what a page must not load, it cannot send either.
+    return (
+        f"default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+@cache
+def _code_and_style() -> tuple[str, str]:
     parts = ((WEB / name).read_text("utf-8") for name in ("plushsense.js", "page.js", "page.css"))
     library, page, style = (_SPARE.sub("", text) for text in parts)
-    code = "\n" + re.sub(r"^export (?=\w)", "", library, flags=re.M) + page
-    style = "\n" + style
-    scripts, styles = (f"'sha256-{_base64(sha256(text.encode()).digest())}'" for text in (code, style))
+    return "\n" + re.sub(r"^export (?=\w)", "", library, flags=re.M) + page, "\n" + style
+
+
+def _page(bundle: Bundle, facts: ModelFacts, image: bytes, module: bytes) -> str:
+    code, style = _code_and_style()
     return fill_text(
         "plushsense.deploy",
         "web/page.html.j2",
         title=f"PlushSense {facts.name}".rstrip(),
-        # No address at all: what a page must not load, it cannot send either.
-        policy=f"default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; img-src data:; "
-        "base-uri 'none'; form-action 'none'",
+        policy=page_policy(),
         style=style,
         # In a script element, < could begin its end.
         settings=json.dumps(_settings(bundle, facts), ensure_ascii=False).replace("<", "\\u003c"),
