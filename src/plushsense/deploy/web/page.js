@@ -51,16 +51,9 @@ const named = (label) => (LATVIAN[label] ? t(label) : label.replace(/^(.*?)( \d+
 const MOST = 2 ** 53, WHOLE = /^[+-]?\d{1,18}$/, DECIMAL = /^[+-]?(\d{1,18}(\.\d{0,18})?|\.\d{1,18})(e[+-]?\d{1,2})?$/i;
 const toEven = (x) => {
   const size = Math.abs(x), low = Math.floor(size), up = size - low > 0.5 || (size - low === 0.5 && low % 2 === 1);
-  return Math.sign(x) * (low + up) + 0;
+  return Math.sign(x) * (low + up) + 0; // no negative zero
 };
-const within = (x) => (Math.abs(x) <= MOST ? x + 0 : null); // + 0: no negative zero
-const whole = (field) => {
-  if (!WHOLE.test(field)) return null;
-  if (field.length < 16) return Number(field) + 0;
-  const exact = BigInt(field);
-  return exact <= MOST && exact >= -MOST ? Number(exact) : null;
-};
-const isGarbage = (values) => values.some((v, i) => v < channels[i].low || v > channels[i].high);
+const whole = (field) => (WHOLE.test(field) && (field.length < 16 || (BigInt(field) <= MOST && BigInt(field) >= -MOST)) ? Number(field) + 0 : null);
 
 class LineParser {
   /** `joining`: reading may begin in the middle of a line, so the first one is dropped. */
@@ -113,7 +106,7 @@ class LineParser {
     }
     const values = this.at.map((at) => numbers[at]);
     this.frames++;
-    this.garbage += isGarbage(values);
+    this.garbage += values.some((v, i) => v < channels[i].low || v > channels[i].high);
     return { ms, values };
   }
 
@@ -135,9 +128,9 @@ class LineParser {
     const numbers = wire.map((_, at) => (at === clockAt || at === delayAt ? whole(fields[at]) : 0));
     for (let i = 0; i < channels.length; i++) {
       const field = fields[this.at[i]], step = channels[i].step;
-      const value = step === 1 ? whole(field) : DECIMAL.test(field) ? within(Number(field) / step) : null;
+      const value = step === 1 ? whole(field) : DECIMAL.test(field) && Math.abs(Number(field) / step) <= MOST ? toEven(Number(field) / step) : null;
       if (value === null) return null;
-      numbers[this.at[i]] = step === 1 ? value : toEven(value);
+      numbers[this.at[i]] = value;
     }
     return numbers;
   }
@@ -179,8 +172,7 @@ function readFile(bytes, name) {
   if (text.slice(0, 4096).includes("\0")) return null;
   const first = text.slice(0, 1e6).split("\n", 1)[0], wires = [layout.wire, ...settings.wires];
   if (!separatorOf(first) && wires.some((wire) => wire.length === cut(first).length)) {
-    const parser = new LineParser();
-    const frames = parser.feed(bytes);
+    const parser = new LineParser(), frames = parser.feed(bytes);
     return frames.length ? { frames, malformed: parser.malformed } : null;
   }
   // The last line of a session's stream may be cut off; a recording is named LABEL_TIME_ROWS.csv.
@@ -194,18 +186,14 @@ function readFile(bytes, name) {
     const cells = cut(line, separator);
     while (cells.length > of.keys.length && !cells.at(-1)) cells.pop();
     const fits = cells.length === of.keys.length && cells.every((cell, i) => of.keys[i] === "label" || (NUMBER.test(cell) && Math.abs(Number(cell)) < MOST));
-    if (fits) rows.push(cells.map(Number));
-    else malformed++;
+    fits ? rows.push(cells.map(Number)) : malformed++;
   }
   const column = (key) => (of.keys.includes(key) ? rows.map((row) => toEven(row[of.keys.indexOf(key)])) : null);
   const host = column("host_ms");
   let clock = column("device_ms"), delays = column("delay_ms");
   if (clock && !delays && areDelays(clock, host)) [delays, clock] = [clock, null];
-  if (!clock && delays) {
-    let ms = -delays[0];
-    clock = delays.map((delay) => (ms += delay));
-  }
-  clock ??= host;
+  let ms = delays ? -delays[0] : 0;
+  clock ??= delays?.map((delay) => (ms += delay)) ?? host;
   if (!rows.length || !clock) return null;
   const at = channels.map((c) => of.keys.indexOf(c.name));
   return { malformed, frames: rows.map((row, n) => ({ ms: clock[n], values: at.map((i, c) => toEven(row[i] / channels[c].step)) })) };
@@ -267,18 +255,15 @@ async function stop(sentence = "") {
 function take(own, frames) {
   if (own.over || !frames.length) return;
   for (const { ms, values } of frames) {
-    const step = own.ms === null ? 0 : ms - own.ms;
-    own.s += (step < 0 ? period : step) / 1000;
-    own.ms = ms;
+    const step = ms - (own.ms ?? ms);
+    [own.s, own.ms] = [own.s + (step < 0 ? period : step) / 1000, ms];
     own.toy.push(values, ms);
     ring.s[ring.n % KEPT] = own.s;
     for (let i = 0; i < values.length; i++) ring.y[i][ring.n % KEPT] = values[i];
     ring.n++;
     rows?.push(row(ms, values));
   }
-  own.frames += frames.length;
-  own.at = performance.now();
-  own.quiet = false;
+  Object.assign(own, { frames: own.frames + frames.length, at: performance.now(), quiet: false });
   draw();
 }
 
@@ -377,8 +362,8 @@ const attempt = (connect) => async () => {
   try {
     await connect();
   } catch (cause) {
-    if (cause.name === "NotFoundError") say("message", t("No toy was chosen."));
-    else say("message", cause instanceof PlushError ? t("This browser cannot run the model: {why}", { why: cause.message }) : t("The toy could not be connected ({why}). Close other programs that use it, and try again.", { why: cause.message }));
+    const sentence = cause instanceof PlushError ? "This browser cannot run the model: {why}" : "The toy could not be connected ({why}). Close other programs that use it, and try again.";
+    say("message", t(cause.name === "NotFoundError" ? "No toy was chosen." : sentence, { why: cause.message }));
   }
 };
 
@@ -508,15 +493,16 @@ function drawSignals(now) {
     [canvas.width, canvas.height, drawn] = [Math.round(wide * ratio), Math.round(high * ratio), 0];
     canvas.style.height = `${high}px`;
   }
-  const from = Math.max(0, ring.n - KEPT, ring.n - Math.ceil(0.98 * SHOWN_S * layout.rate_hz));
-  if (!drawn || now - rangedAt > 1000) setRanges(from, now);
+  if (!drawn || now - rangedAt > 1000) setRanges(now);
   if (ring.n === drawn) return;
-  const c = (pen ??= canvas.getContext("2d", { alpha: false })), first = Math.max(from, drawn - 1), x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
+  const c = (pen ??= canvas.getContext("2d", { alpha: false })), last = (ring.n - 1) % KEPT, x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
+  let first = Math.max(0, ring.n - KEPT, drawn - 1);
+  // All anew where the end of the picture or a gap is passed.
+  if (!drawn || x(last) < x(first) || ring.s[last] - ring.s[first % KEPT] > 1) [drawn, first] = [0, Math.max(0, ring.n - KEPT)];
+  while (ring.s[first % KEPT] < ring.s[last] - 0.98 * SHOWN_S) first++;
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
-  c.fillStyle = ink.back;
-  c.strokeStyle = ink.trace;
-  if (!drawn) c.fillRect(0, 0, wide, high);
-  else c.fillRect(x(first) + 1, 0, Math.max(x(ring.n - 1) - x(first), 0) + 16, high);
+  [c.fillStyle, c.strokeStyle] = [ink.back, ink.trace];
+  c.fillRect(drawn ? x(first) + 1 : 0, 0, drawn ? x(last) - x(first) + 16 : wide, high);
   c.beginPath();
   for (let i = 0; i < channels.length; i++) {
     const [low, top] = ranges[i], values = ring.y[i];
@@ -532,7 +518,8 @@ function drawSignals(now) {
 }
 
 /** A lane shows many times its noise, so that it is flat at rest; it widens at once, and narrows when its signal has long been small. */
-function setRanges(from, now) {
+function setRanges(now) {
+  const from = Math.max(0, ring.n - KEPT);
   rangedAt = now;
   for (const [i, y] of ring.y.entries()) {
     let [low, top, moved] = [Infinity, -Infinity, 0];
