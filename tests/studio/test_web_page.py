@@ -1,4 +1,4 @@
-"""The page of an export in a real Chromium, with a stand-in for the serial port: what it reads, decides, shows and saves.
+"""The page of an export in a real Chromium, with a stand-in for the serial port: what it reads, decides and saves.
 
 Each thing is compared with the Python that defines it, on the same bytes.
 """
@@ -6,7 +6,6 @@ Each thing is compared with the Python that defines it, on the same bytes.
 from __future__ import annotations
 
 import base64
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import IntegerClassifier
 from plushsense.runtime.image import IntegerModel
 from plushsense.studio.app.words import Words
-from support.browsing import PHONE, Look, Studio, axe, english, marked
+from support.browsing import KEPT, PHONE, Look, Studio, axe, english, keep_picture, marked
 from support.exports import bundle_of, exported
 from support.requirements import LONG
 from support.sent_lines import format_line
@@ -70,7 +69,9 @@ class Opened:
     def send(self, data: bytes, size: int = 5000) -> None:
         """Have the port send bytes, in pieces, and wait until all are read."""
         pieces = [base64.b64encode(data[at : at + size]).decode() for at in range(0, len(data), size)]
-        self.page.evaluate("async (all) => { for (const p of all) { sendBytes(p); await new Promise(setTimeout) } }", pieces)
+        self.page.evaluate(
+            "async (all) => { for (const p of all) { sendBytes(p); await new Promise(setTimeout) } }", pieces
+        )
 
     def text(self, name: str) -> str:
         """The text of an element."""
@@ -141,7 +142,16 @@ def _answers(classifier: IntegerClassifier, frames: list[Frame]) -> tuple[list[A
                 events.append((*what, " ".join(reacted.pop()) if reacted and e.kind == "begun" else ""))
             if d.source == "cnn" and d.state == "tracking":
                 kind = kinds.get(d.answer or "", d.answer)
-                steps.append([int(d.t_s * 1e6 + 0.5) // 1000 + first, d.state, kind, d.affect, labels.index(d.gesture or ""), d.confidence])
+                steps.append(
+                    [
+                        int(d.t_s * 1e6 + 0.5) // 1000 + first,
+                        d.state,
+                        kind,
+                        d.affect,
+                        labels.index(d.gesture or ""),
+                        d.confidence,
+                    ]
+                )
     return steps, events
 
 
@@ -153,8 +163,11 @@ def test_the_page_decides_as_live_int8_on_the_same_bytes(pages: Callable[..., Op
     data = _bytes(_PLUSH, frames[:2000]) + b"1 2 3\nnoise \xff\n" + _bytes(_PLUSH, late)
     opened.connect()
     assert opened.page.evaluate("() => portOptions().baudRate") == 115_200
-    half = len(data) // 2
+    half = len(_bytes(_PLUSH, frames[:850]))
     opened.send(b"4 5 6\n" + data[:half], 997)
+    if KEPT:
+        opened.page.wait_for_function("() => document.getElementById('face').dataset.eyes === 'green'")
+    keep_picture(opened.page.screenshot(), "page-desk-light-en", 960)
     # A tab in the background: nothing runs for longer than a silence, then all that has come at once.
     waiting = base64.b64encode(data[half:]).decode()
     hold = "(bytes) => { sendBytes(bytes); const at = performance.now(); while (performance.now() - at < 1300); }"
@@ -178,8 +191,22 @@ def test_the_page_decides_as_live_int8_on_the_same_bytes(pages: Callable[..., Op
 def test_lines_are_read_as_in_python_wherever_they_are_cut(pages: Callable[..., Opened], layout: str) -> None:
     opened, chosen = pages(layout), load_layout(layout)
     rng = np.random.default_rng(7)
-    words = [*"1 -2 +3 -0 007 12.5 .5 5. 1e3 2.5e-1 1e 0x1 1_0 - nan".split(), "9" * 15, "9" * 16, "9" * 18, "9" * 19]
-    words += [str(2**53), str(2**53 + 1), str(-(2**53)), str(2**31 + 1), "0.0005", "0.0015", "-0.0025", "\v", "\xff"]
+    words = ["1", "-2", "+3", "-0", "007", "12.5", ".5", "5.", "1e3", "2.5e-1", "1e", "0x1", "1_0", "-", "nan"]
+    words += [
+        "9" * 15,
+        "9" * 16,
+        "9" * 18,
+        "9" * 19,
+        str(2**53),
+        str(2**53 + 1),
+        str(-(2**53)),
+        str(2**31 + 1),
+        "0.0005",
+        "0.0015",
+        "-0.0025",
+        "\v",
+        "\xff",
+    ]
     cases = []
     for joining in (False, True) * 100:
         lines = []
@@ -187,7 +214,9 @@ def test_lines_are_read_as_in_python_wherever_they_are_cut(pages: Callable[..., 
             fields = [str(v) for v in rng.integers(0, 500, len(chosen.wire) + int(rng.choice([0, 0, 0, 0, 1, -1])))]
             for at in rng.integers(0, len(fields), rng.integers(0, 3)):
                 fields[at] = str(rng.choice(words))
-            lines.append(str(rng.choice([" ", "  ", ",", "\t", " ; "])).join(fields) + str(rng.choice(["\n", "\r\n", "\r"])))
+            lines.append(
+                str(rng.choice([" ", "  ", ",", "\t", " ; "])).join(fields) + str(rng.choice(["\n", "\r\n", "\r"]))
+            )
         data = "".join(lines).encode("latin-1") + (b"7" * 900 + b"\n1" if rng.random() < 0.1 else b"")
         cuts = sorted(rng.integers(0, len(data), 9).tolist())
         cases.append((joining, data, [data[a:b] for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True)]))
@@ -213,17 +242,24 @@ def _files(folder: Path) -> dict[str, bytes]:
     delays = [[*row[:14], 9 + n % 3] for n, row in enumerate(rows)]
     table = {name: [[str(v) for v in row] for row in of] for name, of in (("clock", rows), ("delays", delays))}
     titles = "; ".join(_PLUSH.csv.header)
-    files = {f"Tail tap 1_{10**12}_{n}.csv": "\r\n".join([titles, *map("; ".join, of)]) for n, of in enumerate(table.values())}
+    files = {
+        f"Tail tap 1_{10**12}_{n}.csv": "\r\n".join([titles, *map("; ".join, of)])
+        for n, of in enumerate(table.values())
+    }
     files["fulldatastream.csv"] = "".join(";".join(row) + "\n" for row in table["clock"]) + "3;4;5"
     files["spoilt.csv"] = "\ufeff\n" + "\n".join([titles, "1;2", *map(";".join, table["clock"]), "x;" * 15, ""])
     files["short.csv"] = "1;2;3\n"
     return {name: text.encode() for name, text in files.items()}
 
 
-def test_files_are_read_as_in_python_and_hostile_ones_get_one_sentence(pages: Callable[..., Opened], tmp_path: Path) -> None:
+def test_files_are_read_as_in_python_and_hostile_ones_get_one_sentence(
+    pages: Callable[..., Opened], tmp_path: Path
+) -> None:
     opened = pages()
-    read = """([text, name]) => { const r = plushPage.readFile(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)), name);
-      return r && [r.malformed, r.frames.map((f) => [f.ms, f.values])] }"""
+    read = """([text, name]) => {
+      const read = plushPage.readFile(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)), name);
+      return read && [read.malformed, read.frames.map((f) => [f.ms, f.values])];
+    }"""
     for name, content in _files(tmp_path).items():
         got = opened.page.evaluate(read, [base64.b64encode(content).decode(), name])
         (tmp_path / name).write_bytes(content)
@@ -232,9 +268,16 @@ def test_files_are_read_as_in_python_and_hostile_ones_get_one_sentence(pages: Ca
             continue
         result = (read_recording if name.startswith("Tail") else read_stream)(tmp_path / name, _PLUSH)
         frames = result.frames
-        assert got[1] == [[ms, v] for ms, v in zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True)], name
+        assert got[1] == [[ms, v] for ms, v in zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True)], (
+            name
+        )
         assert got[0] == result.malformed - result.cut, name
-    for name, content in (("a.csv", b"\x00\x01" * 50), ("b.csv", b""), ("c.html", b"<script>alert(1)</script>"), ("d", b"1 2\n")):
+    for name, content in (
+        ("a.csv", b"\x00\x01" * 50),
+        ("b.csv", b""),
+        ("c.html", b"<script>alert(1)</script>"),
+        ("d", b"1 2\n"),
+    ):
         opened.page.set_input_files("#file", {"name": name, "mimeType": "text/csv", "buffer": content})
         opened.until("message", f"“{name}” cannot be played: it is not a recording")
     # A virtual toy's lines, played to their end.
@@ -244,7 +287,9 @@ def test_files_are_read_as_in_python_and_hostile_ones_get_one_sentence(pages: Ca
     assert opened.page.is_checked("#simulated") and "Simulation: these data" in opened.text("mark")
 
 
-def test_what_happens_is_named_spoken_and_saved_in_both_languages(pages: Callable[..., Opened], trained: Bundle, tmp_path: Path) -> None:
+def test_what_happens_is_named_spoken_and_saved_in_both_languages(
+    pages: Callable[..., Opened], trained: Bundle, tmp_path: Path
+) -> None:
     opened = pages(trained, size=PHONE, dark=True, language="lv")
     page = opened.page
     opened.until("state", "Nav sākts")
@@ -257,6 +302,12 @@ def test_what_happens_is_named_spoken_and_saved_in_both_languages(pages: Callabl
     frames = _stream(_PLUSH, 15)
     opened.send(b"\n" + _bytes(_PLUSH, frames))
     opened.until("rows", f"{len(frames)} kadri")
+    # Something is drawn in each lane.
+    page.wait_for_function("""() => [...Array(13).keys()].every((lane) => {
+      const { width, height } = canvas, begin = height * lane / 13;
+      const { data } = canvas.getContext('2d').getImageData(0, begin, width, height / 13);
+      return new Set(data).size > 8;
+    })""")
     with page.expect_download() as kept:
         page.click("#record")
     assert axe(page) == []
@@ -331,6 +382,24 @@ def test_the_studio_opens_and_saves_the_page_of_an_export(
         assert page.request.get(f"{url}/page/{name}").status == 404
 
 
+def test_the_page_of_the_documentation_reads_a_toy(look: Callable[..., Look], trained: Bundle, tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "browser.md").read_text("utf-8")
+    html = text.split("```html\n")[1].split("```")[0]
+    web = exported(tmp_path / "out", trained) / "web"
+    (web / IMAGE).write_bytes((web.parent / IMAGE).read_bytes())
+    page = look(own=True).context.new_page()
+    page.add_init_script(f"({_PORT})()")
+    page.route("http://127.0.0.1:9/*", lambda route: route.fulfill(path=web / route.request.url.rpartition("/")[2]))
+    page.route("http://127.0.0.1:9/", lambda route: route.fulfill(body=html, content_type="text/html"))
+    page.goto("http://127.0.0.1:9/")
+    page.wait_for_function("() => connect.onclick")
+    page.click("#connect")
+    page.wait_for_function("() => portOptions()")
+    data = base64.b64encode(_bytes(_PLUSH, _stream(_PLUSH, 16))).decode()
+    page.evaluate("(data) => sendBytes(data)", data)
+    page.wait_for_function("() => state.textContent === 'begun: negative'")
+
+
 @pytest.mark.exhaustive
 def test_half_an_hour_needs_no_more_memory_than_a_minute(pages: Callable[..., Opened]) -> None:
     _grows(pages(), 30 if not LONG else 240)
@@ -352,7 +421,9 @@ def _grows(opened: Opened, minutes: int) -> None:
         opened.send(_bytes(_PLUSH, moved))
         session.send("HeapProfiler.collectGarbage")
         metrics = {m["name"]: m["value"] for m in session.send("Performance.getMetrics")["metrics"]}
-        wasm = opened.page.evaluate("() => { answers.length = 0; return plushPage.run.toy._c.memory.buffer.byteLength }")
+        wasm = opened.page.evaluate(
+            "() => { answers.length = 0; return plushPage.run.toy._c.memory.buffer.byteLength }"
+        )
         used.append((metrics["JSHeapUsedSize"] / 1e6, wasm))
     assert used[-1][0] < used[0][0] + 1.5, used
     assert used[-1][1] == used[0][1]

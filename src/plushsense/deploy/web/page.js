@@ -493,7 +493,7 @@ function drawSignals(now) {
     [canvas.width, canvas.height, drawn] = [Math.round(wide * ratio), Math.round(high * ratio), 0];
     canvas.style.height = `${high}px`;
   }
-  if (!drawn || now - rangedAt > 1000) setRanges(now);
+  if (ring.n && (!drawn || now - rangedAt > 1000)) setRanges(now);
   if (ring.n === drawn) return;
   const c = (pen ??= canvas.getContext("2d", { alpha: false })), last = (ring.n - 1) % KEPT, x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
   let first = Math.max(0, ring.n - KEPT, drawn - 1);
