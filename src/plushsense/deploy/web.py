@@ -124,8 +124,11 @@ def run_module(folder: Path, image: Path, cases: Path, *words: str, timeout_s: f
         raise ProgramError(f"The module in Node did not end within {timeout_s:g} s: it was stopped.", "") from None
     if done.returncode != 0:
         errors = done.stderr.decode(errors="replace").strip()
-        last = next((line for line in errors.splitlines() if "Error" in line), errors[-200:])
-        raise ProgramError(f"The module in Node ended with status {done.returncode}. Its error: {last}", errors)
+        found = re.search(r"^\w*Error\b.*", errors, re.M)
+        raise ProgramError(
+            f"The module in Node ended with status {done.returncode}: {found[0] if found else 'it names no error'}",
+            errors,
+        )
     return done.stdout
 
 
