@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import dataclass
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.templates import fill_text
 from plushsense.deploy.code import ModelFacts
 from plushsense.deploy.wasm import WEB
-from plushsense.live.reactions import load_reactions
+from plushsense.live.reactions import load_reactions, reaction_names
 from plushsense.models.bundle import Bundle
 
 SCRIPT = "web/plushsense.js"
@@ -24,6 +25,8 @@ MODULE = "web/plushsense.wasm"
 PAGE = "web/index.html"
 WASM = "wasm"  # the target that runs the module of an export as it is, by way of its plushsense.js, as a page does
 _ENGINE = "node"
+# Comments on lines of their own, and indentation: a sixth of the page.
+_SPARE = re.compile(r"^[ \t]*(?://.*\n|/\*(?:.|\n)*?\*/[ \t]*\n)?[ \t]*", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -45,18 +48,30 @@ def web_files(bundle: Bundle, facts: ModelFacts, image: bytes, module: bytes | N
     return files
 
 
+def page_policy() -> str:
+    """Return the Content-Security-Policy of the page of this version: its own script and style, and no request."""
+    scripts, styles = (f"'sha256-{_base64(sha256(text.encode()).digest())}'" for text in _code_and_style())
+    # No address at all: what a page must not load, it cannot send either.
+    return (
+        f"default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+@cache
+def _code_and_style() -> tuple[str, str]:
+    parts = ((WEB / name).read_text("utf-8") for name in ("plushsense.js", "page.js", "page.css"))
+    library, page, style = (_SPARE.sub("", text) for text in parts)
+    return "\n" + re.sub(r"^export (?=\w)", "", library, flags=re.M) + page, "\n" + style
+
+
 def _page(bundle: Bundle, facts: ModelFacts, image: bytes, module: bytes) -> str:
-    library, page, style = ((WEB / name).read_text("utf-8") for name in ("plushsense.js", "page.js", "page.css"))
-    code = "\n" + re.sub(r"^ */\*\*.*?\*/\n|^export (?=\w)", "", library + page, flags=re.M | re.S)
-    style = "\n" + style
-    scripts, styles = (f"'sha256-{_base64(sha256(text.encode()).digest())}'" for text in (code, style))
+    code, style = _code_and_style()
     return fill_text(
         "plushsense.deploy",
         "web/page.html.j2",
-        title=facts.title,
-        # No address at all: what a page must not load, it cannot send either.
-        policy=f"default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; img-src data:; "
-        "base-uri 'none'; form-action 'none'",
+        title=f"PlushSense {facts.name}".rstrip(),
+        policy=page_policy(),
         style=style,
         # In a script element, < could begin its end.
         settings=json.dumps(_settings(bundle, facts), ensure_ascii=False).replace("<", "\\u003c"),
@@ -76,7 +91,7 @@ def _settings(bundle: Bundle, facts: ModelFacts) -> dict[str, object]:
         "layout": {**layout.to_dict(), "channels": channels},
         "wires": _other_wires(layout),
         "gestures": [{"label": g.label, "affect": g.affect} for g in facts.gestures],
-        "reactions": load_reactions("standard").to_dict()["reactions"],
+        "reactions": {name: load_reactions(name).to_dict()["reactions"] for name in reaction_names()},
     }
 
 

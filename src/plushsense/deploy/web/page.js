@@ -51,16 +51,9 @@ const named = (label) => (LATVIAN[label] ? t(label) : label.replace(/^(.*?)( \d+
 const MOST = 2 ** 53, WHOLE = /^[+-]?\d{1,18}$/, DECIMAL = /^[+-]?(\d{1,18}(\.\d{0,18})?|\.\d{1,18})(e[+-]?\d{1,2})?$/i;
 const toEven = (x) => {
   const size = Math.abs(x), low = Math.floor(size), up = size - low > 0.5 || (size - low === 0.5 && low % 2 === 1);
-  return Math.sign(x) * (low + up) + 0;
+  return Math.sign(x) * (low + up) + 0; // no negative zero
 };
-const within = (x) => (Math.abs(x) <= MOST ? x + 0 : null); // + 0: no negative zero
-const whole = (field) => {
-  if (!WHOLE.test(field)) return null;
-  if (field.length < 16) return Number(field) + 0;
-  const exact = BigInt(field);
-  return exact <= MOST && exact >= -MOST ? Number(exact) : null;
-};
-const isGarbage = (values) => values.some((v, i) => v < channels[i].low || v > channels[i].high);
+const whole = (field) => (WHOLE.test(field) && (field.length < 16 || (BigInt(field) <= MOST && BigInt(field) >= -MOST)) ? Number(field) + 0 : null);
 
 class LineParser {
   /** `joining`: reading may begin in the middle of a line, so the first one is dropped. */
@@ -91,13 +84,10 @@ class LineParser {
   }
 
   keep(piece) {
-    if (this.skipping) return;
-    this.pending += piece;
+    if (!this.skipping) this.pending += piece;
     if (this.pending.length <= this.longest) return;
-    this.malformed++;
-    this.note(this.pending);
-    this.pending = "";
-    this.skipping = true;
+    this.refuse(this.pending);
+    [this.pending, this.skipping] = ["", true];
   }
 
   take() {
@@ -106,12 +96,7 @@ class LineParser {
     const fields = line.split(/[ ,;\t]+/).filter(Boolean);
     if (skipped || !fields.length) return null;
     const numbers = this.numbers(fields);
-    if (!numbers) {
-      this.malformed++;
-      if (!joined) this.note(line);
-      this.other(fields);
-      return null;
-    }
+    if (!numbers) return this.refuse(joined ? "" : line, fields);
     this.unreadable = this.others = 0;
     if (joined) return null;
     let ms = numbers[this.clockAt];
@@ -121,19 +106,18 @@ class LineParser {
     }
     const values = this.at.map((at) => numbers[at]);
     this.frames++;
-    this.garbage += isGarbage(values);
+    this.garbage += values.some((v, i) => v < channels[i].low || v > channels[i].high);
     return { ms, values };
   }
 
-  note(line) {
-    if (!this.unreadable++) this.unread = line.slice(0, 100).replace(/[^ -~]/g, "?");
-  }
-
-  /** Older firmware of the same toy, by the number of its numbers: read it from here on. */
-  other(fields) {
+  /** Count a malformed line. Ten of another number of numbers are of older firmware of the toy: read it from here on. */
+  refuse(line, fields = []) {
+    this.malformed++;
+    if (line && !this.unreadable++) this.unread = line.slice(0, 100).replace(/[^ -~]/g, "?");
     const fits = settings.wires.find((wire) => wire.length === fields.length && wire.length !== this.wire.length);
     this.others = fits && fields.every((field) => DECIMAL.test(field)) ? this.others + 1 : 0;
     if (this.others >= 10 && !this.frames) this.use(fits);
+    return null;
   }
 
   numbers(fields) {
@@ -144,9 +128,9 @@ class LineParser {
     const numbers = wire.map((_, at) => (at === clockAt || at === delayAt ? whole(fields[at]) : 0));
     for (let i = 0; i < channels.length; i++) {
       const field = fields[this.at[i]], step = channels[i].step;
-      const value = step === 1 ? whole(field) : DECIMAL.test(field) ? within(Number(field) / step) : null;
+      const value = step === 1 ? whole(field) : DECIMAL.test(field) && Math.abs(Number(field) / step) <= MOST ? toEven(Number(field) / step) : null;
       if (value === null) return null;
-      numbers[this.at[i]] = step === 1 ? value : toEven(value);
+      numbers[this.at[i]] = value;
     }
     return numbers;
   }
@@ -188,8 +172,7 @@ function readFile(bytes, name) {
   if (text.slice(0, 4096).includes("\0")) return null;
   const first = text.slice(0, 1e6).split("\n", 1)[0], wires = [layout.wire, ...settings.wires];
   if (!separatorOf(first) && wires.some((wire) => wire.length === cut(first).length)) {
-    const parser = new LineParser();
-    const frames = parser.feed(bytes);
+    const parser = new LineParser(), frames = parser.feed(bytes);
     return frames.length ? { frames, malformed: parser.malformed } : null;
   }
   // The last line of a session's stream may be cut off; a recording is named LABEL_TIME_ROWS.csv.
@@ -203,18 +186,14 @@ function readFile(bytes, name) {
     const cells = cut(line, separator);
     while (cells.length > of.keys.length && !cells.at(-1)) cells.pop();
     const fits = cells.length === of.keys.length && cells.every((cell, i) => of.keys[i] === "label" || (NUMBER.test(cell) && Math.abs(Number(cell)) < MOST));
-    if (fits) rows.push(cells.map(Number));
-    else malformed++;
+    fits ? rows.push(cells.map(Number)) : malformed++;
   }
   const column = (key) => (of.keys.includes(key) ? rows.map((row) => toEven(row[of.keys.indexOf(key)])) : null);
   const host = column("host_ms");
   let clock = column("device_ms"), delays = column("delay_ms");
   if (clock && !delays && areDelays(clock, host)) [delays, clock] = [clock, null];
-  if (!clock && delays) {
-    let ms = -delays[0];
-    clock = delays.map((delay) => (ms += delay));
-  }
-  clock ??= host;
+  let ms = delays ? -delays[0] : 0;
+  clock ??= delays?.map((delay) => (ms += delay)) ?? host;
   if (!rows.length || !clock) return null;
   const at = channels.map((c) => of.keys.indexOf(c.name));
   return { malformed, frames: rows.map((row, n) => ({ ms: clock[n], values: at.map((i, c) => toEven(row[i] / channels[c].step)) })) };
@@ -251,7 +230,8 @@ async function begin(source) {
   toy.onEvent = (event) => change(own, event);
   run = own;
   ring.n = 0;
-  $("stop").disabled = $("log").disabled = $("record").disabled = false;
+  for (const id of ["stop", "log", "record"]) $(id).disabled = false;
+  document.body.classList.add("running"); // hides what connects
   say("message", source.file ? t("Playing “{file}”, a recording.", source) : t("Reading the toy."));
   dispatchEvent(new CustomEvent("plushsense", { detail: own }));
   navigator.wakeLock?.request("screen").catch(() => {});
@@ -264,7 +244,8 @@ async function stop(sentence = "") {
   if (!old || old.over) return;
   old.over = true;
   old.toy.silence(); // ends what is going on
-  $("stop").disabled = true;
+  $("stop").disabled = $("record").disabled = true;
+  document.body.classList.remove("running");
   if (rows) record();
   say("message", sentence);
   redraw();
@@ -274,18 +255,15 @@ async function stop(sentence = "") {
 function take(own, frames) {
   if (own.over || !frames.length) return;
   for (const { ms, values } of frames) {
-    const step = own.ms === null ? 0 : ms - own.ms;
-    own.s += (step < 0 ? period : step) / 1000;
-    own.ms = ms;
+    const step = ms - (own.ms ?? ms);
+    [own.s, own.ms] = [own.s + (step < 0 ? period : step) / 1000, ms];
     own.toy.push(values, ms);
     ring.s[ring.n % KEPT] = own.s;
     for (let i = 0; i < values.length; i++) ring.y[i][ring.n % KEPT] = values[i];
     ring.n++;
     rows?.push(row(ms, values));
   }
-  own.frames += frames.length;
-  own.at = performance.now();
-  own.quiet = false;
+  Object.assign(own, { frames: own.frames + frames.length, at: performance.now(), quiet: false });
   draw();
 }
 
@@ -384,8 +362,8 @@ const attempt = (connect) => async () => {
   try {
     await connect();
   } catch (cause) {
-    if (cause.name === "NotFoundError") say("message", t("No toy was chosen."));
-    else say("message", cause instanceof PlushError ? t("This browser cannot run the model: {why}", { why: cause.message }) : t("The toy could not be connected ({why}). Close other programs that use it, and try again.", { why: cause.message }));
+    const sentence = cause instanceof PlushError ? "This browser cannot run the model: {why}" : "The toy could not be connected ({why}). Close other programs that use it, and try again.";
+    say("message", t(cause.name === "NotFoundError" ? "No toy was chosen." : sentence, { why: cause.message }));
   }
 };
 
@@ -424,7 +402,8 @@ function record() {
 const SIGNS = { positive: "+", neutral: "○", negative: "−", none: "·" };
 const say = (id, text) => { if ($(id).textContent !== text) $(id).textContent = text; };
 const make = (tag, text = "", values = {}) => Object.assign(document.createElement(tag), { textContent: text }, values);
-let frame = 0, textAt = 0, listed = false, drawn = 0, ranges = [], rangedAt = 0, spoken = null, speaking = 0;
+const LANE = 44, ink = {};
+let pen = null, frame = 0, textAt = 0, listed = false, drawn = 0, ranges = [], rangedAt = 0, spoken = null, speaking = 0, told = 0;
 
 /** At most one sentence in 2.5 seconds, always the newest. */
 function speak(text) {
@@ -467,14 +446,14 @@ function showTexts() {
     li.lastChild.textContent = percent === null ? "–" : `${percent} %`;
   }
   if (rows) say("rows", t("{n} frames", { n: rows.length }));
-  if (run) {
+  if (run && ++told % 4 === 0) {
     const n = run.toy.counts();
     say("counts", t("Frames: {frames}. Unreadable lines: {bad}. Invalid values: {invalid}. Gaps: {gaps}.", { frames: run.frames, bad: run.parser.malformed, invalid: n.invalid, gaps: n.restarts }));
   }
   const marks = [$("simulated").checked && "Simulation: these data say nothing about a real toy.", settings.simulated && "Simulation: this network was trained on virtual people. What it says about a real toy proves nothing."];
   say("mark", marks.filter(Boolean).map((text) => t(text)).join(" "));
   $("mark").hidden = !$("mark").textContent;
-  if (!listed || run?.spans.at(-1)?.to === null) showEvents();
+  if (!listed) showEvents();
 }
 
 function showEvents() {
@@ -489,12 +468,12 @@ function showEvents() {
   }));
 }
 
-/** Draw with the next frame of the screen: the signals each time, texts ten times a second. */
+/** Draw with the next frame of the screen: the signals each time, texts four times a second and with each event. */
 function draw() {
   frame ||= requestAnimationFrame((now) => {
     frame = 0;
     drawSignals(now);
-    if (now - textAt < 100) return;
+    if (listed && now - textAt < 250) return;
     textAt = now;
     showTexts();
   });
@@ -502,57 +481,55 @@ function draw() {
 setInterval(draw, 500); // what frames no longer change
 
 function redraw() {
-  ranges = [];
-  drawn = textAt = 0;
-  listed = false;
+  for (const name of ["back", "trace"]) ink[name] = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+  [ranges, drawn, told, listed] = [[], 0, 3, false];
   draw();
 }
 
 /** New samples are drawn over the oldest ones, from left to right: that costs less than to move the picture. */
 function drawSignals(now) {
-  const canvas = $("canvas"), ratio = devicePixelRatio || 1, lane = 44, wide = canvas.clientWidth, high = lane * channels.length;
-  if (canvas.width !== Math.round(wide * ratio) || canvas.height !== Math.round(high * ratio) || ring.n < drawn) {
-    Object.assign(canvas, { width: Math.round(wide * ratio), height: Math.round(high * ratio) });
+  const canvas = $("canvas"), ratio = devicePixelRatio || 1, [wide, high] = [canvas.clientWidth, LANE * channels.length];
+  if (canvas.width !== Math.round(wide * ratio) || canvas.height !== Math.round(high * ratio)) {
+    [canvas.width, canvas.height, drawn] = [Math.round(wide * ratio), Math.round(high * ratio), 0];
     canvas.style.height = `${high}px`;
-    [drawn, ranges] = [0, []];
   }
-  const c = canvas.getContext("2d"), colour = getComputedStyle(document.documentElement), from = Math.max(0, ring.n - KEPT);
-  if (ranges.length === 0 || now - rangedAt > 1000) {
-    rangedAt = now;
-    // Many times the noise, so that a lane at rest is flat; wider as soon, narrower only when the signal has long been small.
-    for (const [i, y] of ring.y.entries()) {
-      let [low, top, moved] = [Infinity, -Infinity, 0];
-      for (let k = from; k < ring.n; k++) {
-        const v = y[k % KEPT];
-        [low, top] = [Math.min(low, v), Math.max(top, v)];
-        if (k > from) moved += Math.abs(v - y[(k - 1) % KEPT]);
-      }
-      const room = Math.max(4, (10 * moved) / Math.max(1, ring.n - from), 0.55 * (top - low)), middle = (low + top) / 2, old = ranges[i];
-      if (ring.n && (!old || low < old[0] || top > old[1] || old[1] - old[0] > 6 * room)) [ranges[i], drawn] = [[middle - room, middle + room], 0];
-    }
-  }
-  const first = Math.max(from, drawn - 1), x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
+  if (ring.n && (!drawn || now - rangedAt > 1000)) setRanges(now);
+  if (ring.n === drawn) return;
+  const c = (pen ??= canvas.getContext("2d", { alpha: false })), last = (ring.n - 1) % KEPT, x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
+  let first = Math.max(0, ring.n - KEPT, drawn - 1);
+  // All anew where the end of the picture or a gap is passed.
+  if (!drawn || x(last) < x(first) || ring.s[last] - ring.s[first % KEPT] > 1) [drawn, first] = [0, Math.max(0, ring.n - KEPT)];
+  while (ring.s[first % KEPT] < ring.s[last] - 0.98 * SHOWN_S) first++;
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
-  if (!drawn) c.clearRect(0, 0, wide, high);
-  if (ring.n - first < 2) return;
-  c.strokeStyle = colour.getPropertyValue("--trace");
+  [c.fillStyle, c.strokeStyle] = [ink.back, ink.trace];
+  c.fillRect(drawn ? x(first) + 1 : 0, 0, drawn ? x(last) - x(first) + 16 : wide, high);
   c.beginPath();
-  for (let k = first; k < ring.n; k++) if (k > first && drawn) c.clearRect(x(k - 1) + 1, 0, Math.max(x(k) - x(k - 1), 0) + 16, high);
-  const oldest = ring.s[(ring.n - 1) % KEPT] - SHOWN_S * 0.98;
-  for (let i = 0; i < channels.length && ranges[i]; i++) {
-    const [low, top] = ranges[i];
-    let pen = false;
+  for (let i = 0; i < channels.length; i++) {
+    const [low, top] = ranges[i], values = ring.y[i];
     for (let k = first; k < ring.n; k++) {
-      if (ring.s[k % KEPT] < oldest) continue;
-      const at = x(k), y = lane * (i + 1) - 3 - ((ring.y[i][k % KEPT] - low) / (top - low)) * (lane - 6);
+      const at = x(k), y = LANE * (i + 1) - 3 - ((values[k % KEPT] - low) / (top - low)) * (LANE - 6);
       // A gap in the clock of the toy is a gap in the line.
-      if (!pen || at < x(k - 1) || ring.s[k % KEPT] - ring.s[(k - 1) % KEPT] > 0.3) c.moveTo(at, y);
+      if (k === first || at < x(k - 1) || ring.s[k % KEPT] - ring.s[(k - 1) % KEPT] > 0.3) c.moveTo(at, y);
       else c.lineTo(at, y);
-      pen = true;
     }
   }
   c.stroke();
   drawn = ring.n;
+}
+
+/** A lane shows many times its noise, so that it is flat at rest; it widens at once, and narrows when its signal has long been small. */
+function setRanges(now) {
+  const from = Math.max(0, ring.n - KEPT);
+  rangedAt = now;
+  for (const [i, y] of ring.y.entries()) {
+    let [low, top, moved] = [Infinity, -Infinity, 0];
+    for (let k = from; k < ring.n; k++) {
+      const v = y[k % KEPT];
+      [low, top, moved] = [Math.min(low, v), Math.max(top, v), moved + (k > from ? Math.abs(v - y[(k - 1) % KEPT]) : 0)];
+    }
+    const room = Math.max(4, (10 * moved) / Math.max(1, ring.n - from), 0.55 * (top - low)), old = ranges[i];
+    if (!old || low < old[0] || top > old[1] || old[1] - old[0] > 6 * room) [ranges[i], drawn] = [[(low + top) / 2 - room, (low + top) / 2 + room], 0];
+  }
 }
 
 function speakLanguage(chosen) {
@@ -594,5 +571,5 @@ for (const node of document.querySelectorAll("[data-language]")) node.addEventLi
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 addEventListener("resize", draw);
 say("model", settings.title);
-window.plushPage = { LineParser, readFile, begin, take, stop };
+window.plushPage = { LineParser, readFile, named, t, get run() { return run; } };
 speakLanguage(language);
