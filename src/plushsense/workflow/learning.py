@@ -106,7 +106,7 @@ def check_sizes(run: Run, sizes: Sequence[int]) -> int:
     if not 1 <= min(sizes) < most or max(sizes) > most:
         raise ConfigError(
             "A learning curve over {sizes} people cannot be measured: a fold of '{split}' is trained on {most}; give "
-            "numbers from 1 to below that, such as 3,6.",
+            "numbers below that.",
             sizes=", ".join(map(str, sizes)),
             split=run.split.text,
             most=most,
