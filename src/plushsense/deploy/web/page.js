@@ -35,7 +35,7 @@ const LATVIAN = {
   "The toy could not be connected ({why}). Close other programs that use it, and try again.": "Rotaļlietu neizdevās savienot ({why}). Aizveriet citas programmas, kas to lieto, un mēģiniet vēlreiz.",
   "No toy was chosen.": "Rotaļlieta nav izvēlēta.", "“{file}” is over.": "„{file}” ir beidzies.", "Playing “{file}”, a recording.": "Atskaņo „{file}”, ierakstu.", "Reading the toy.": "Nolasa rotaļlietu.",
   "“{file}” cannot be played: it is not a recording with the columns or lines of layout {layout}.": "„{file}” nevar atskaņot: tas nav ieraksts ar izkārtojuma {layout} slejām vai rindām.",
-  "“{file}” is larger than {mb} MB; play a part of it.": "„{file}” ir lielāks par {mb} MB; atskaņojiet daļu no tā.", "Lines left out: {n}.": "Izlaistas rindas: {n}.",
+  "“{file}” is larger than {mb} MB; play a part of it.": "„{file}” ir lielāks par {mb} MB; atskaņojiet daļu no tā.",
   "This browser cannot run the model: {why}": "Šī pārlūkprogramma nevar darbināt modeli: {why}", "{n} frames": "{n} kadri",
   "At rest": "Miera stāvoklī", "Back stroke": "Muguras glāstīšana", "Ear scratch": "Ausu kasīšana", "Head stroke": "Galvas glāstīšana", "Hold in hands": "Turēšana rokās", "Hold strong": "Cieša apskaušana",
   "Neck scratch": "Kakla kasīšana", "Tail hit": "Uzsitiens pie astes", "Tail pull": "Astes raušana", "Tail scratch": "Kasīšana pie astes", "Tail tap": "Viegla uzsišana pie astes",
