@@ -101,7 +101,7 @@ def test_the_library_in_javascript(in_node: None, tmp_path: Path) -> None:
     given = {"images": [text(i) for i in (image, *wrong)], "frames": first.tolist(), "more": second.tolist()}
     (tmp_path / "driver.mjs").write_text(DRIVER)
     done = subprocess.run(
-        ["node", str(tmp_path / "driver.mjs"), str(out / SCRIPT)],
+        ["node", str(tmp_path / "driver.mjs"), (out / SCRIPT).as_uri()],
         input=json.dumps({**given, "other": text(other.to_bytes())}),
         capture_output=True,
         text=True,

@@ -75,6 +75,7 @@ export const SOURCES = ["network", "gate"];
 /** A value for a sensor that gave none. */
 export const NO_READING = -(2 ** 31);
 const NO_GESTURE = 255;
+const MOST_EVENTS = 256; // that are kept until events() is called; then the oldest is dropped
 
 const PROBLEMS = [
   "",
@@ -154,11 +155,17 @@ export class Toy {
     const c = this._c;
     const classes = c.plush_classes(this._toy);
     this._numbers = this._room("numbers", 4 * Math.max(11, 5 + 2 * classes));
-    /** @type {string[]} */
+    /** @type {string[]} of the gestures */
     this.names = Array.from({ length: classes }, (_, n) => this._text(c.plush_gesture_name(this._toy, n)));
     this.title = this._text(c.plush_model_title(this._toy));
     this.id = c.plush_model_id(this._toy) >>> 0;
-    [, this.span, this.layout, this.step] = this._all();
+    const [, span, layout, step] = this._all();
+    /** @type {number} samples that the network looks back */
+    this.span = span;
+    /** @type {number} stands for names, units, steps and order of the channels, as PLUSH_MODEL_LAYOUT */
+    this.layout = layout;
+    /** @type {number} samples from one answer to the next */
+    this.step = step;
   }
 
   /** So many bytes of the module's memory, by a name; what was there is overwritten. */
@@ -219,7 +226,7 @@ export class Toy {
       since_ms: since >>> 0,
       ms: ms >>> 0,
     };
-    this._events.push(event);
+    if (this._events.push(event) > MOST_EVENTS) this._events.shift();
     this.onEvent?.(event);
   }
 
