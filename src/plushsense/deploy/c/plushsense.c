@@ -2134,6 +2134,14 @@ void plush_restart(plush_toy *toy)
     toy->seen_ms = 0;
 }
 
+#ifdef PLUSH_CALIBRATE
+PLUSH_SMALL void plush_recalibrate(plush_toy *toy)
+{
+    if (toy->held != NULL)
+        begin_sensors(toy);
+}
+#endif
+
 PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes)
 {
