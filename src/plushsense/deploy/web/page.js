@@ -239,7 +239,7 @@ async function begin(source) {
 
 async function stop(sentence = "") {
   const old = run;
-  if (old?.over ?? true) return;
+  if (!old || old.over) return;
   old.over = true;
   old.toy.silence(); // ends what is going on
   $("stop").disabled = $("record").disabled = true;
