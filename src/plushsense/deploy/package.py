@@ -394,7 +394,7 @@ class ExportResult:
 
     folder: Path
     facts: ModelFacts
-    no_page: Message = Message()
+    no_page: str = ""
 
     @property
     def files(self) -> tuple[str, ...]:
