@@ -410,7 +410,7 @@ def warn_of_long_windows(
     if window_s > max(usual_s, shorter_s):
         then = replace(arch, window=layout.samples(shorter_s), pool=None)
         still = f" (a decision then reads {then.span / layout.rate_hz:.1f} s)" if then.span > then.window else ""
-        advice.append(f"window_s = {shorter_s:g} in [windows] of a --config file, or in a grid{still}")
+        advice.append(f"--window-s {shorter_s:g}{still}")
     if not advice:
         return
     looped = spec.context in ("loop", ROWS)
