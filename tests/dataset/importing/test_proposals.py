@@ -15,7 +15,6 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.guessing import guess_pattern
 from plushsense.dataset.importing.importers import ADOPTED, import_recordings
-from plushsense.dataset.importing.pattern import read_pattern
 from plushsense.dataset.importing.proposals import Sensor, find_sensors
 from plushsense.dataset.importing.sources import readable_layouts
 from plushsense.dataset.index import open_dataset
@@ -337,8 +336,9 @@ def textile(folder: Path, apart: float, gestures: int = 3) -> Path:
         for take in range(4 * gestures):
             touch = np.sin(np.arange(120) * np.pi / 120 * (1 + take % gestures)) ** 2 * (np.arange(120) > 30)
             values = rest + np.outer(touch, [20, -4000]) + rng.normal(0, [0.2, 40], (120, 2))
+            begin = 10**12 + 10**6 * person + 10_000 * take
             lines += [
-                f"P{person},{10**12 + 10**6 * person + 10_000 * take + 20 * i},{c:.2f},{r:.0f},{i % 7},g{take % gestures}"
+                f"P{person},{begin + 20 * i},{c:.2f},{r:.0f},{i % 7},g{take % gestures}"
                 for i, (c, r) in enumerate(values)
             ]
     (folder / "t.csv").write_text("\n".join(lines) + "\n")
@@ -355,12 +355,14 @@ def test_channels_whose_rest_differs_between_people_are_proposed_to_calibrate_th
     advice = 'give a layout with self_calibration = ["capacitance", "resistance"], or import anew with --adopt'
     assert (advice in ran.err) == proposed and not open_dataset(tmp_path / "DS").layout.self_calibration
     # A layout without the valid range that the key needs gets it.
-    plain = replace(read_pattern(pattern).known_layout() or ACCEL)
-    channels = tuple(replace(c, valid_min=-(2.0**31) * c.step, valid_max=(2.0**31 - 1) * c.step) for c in plain.channels)
-    for layout in (None, replace(plain, channels=channels)):
-        place = tmp_path / f"ADOPTED{layout is None}"
+    guessed = guess_pattern(source).pattern.known_layout() or ACCEL
+    wide = tuple(replace(c, valid_min=-1e6, valid_max=1e6) for c in guessed.channels)
+    for given in (guessed.channels, wide):
+        place = tmp_path / str(given is wide)
+        layout = replace(guessed, channels=given)
         done = import_recordings(source, place, pattern=pattern, layout=layout, adopt_proposals=True)
         found = open_dataset(place).layout
         assert found.self_calibration == (("capacitance", "resistance") if proposed else ())
         assert all(p.adopted for p in done.proposals if p.key != "window_s")
-        assert abs(found.channels[0].valid_max) == (2**20 * 0.01 if proposed or layout is None else channels[0].valid_max)
+        limits = guessed.channels[0] if proposed else given[0]
+        assert found.channels[0].valid_max == -found.channels[0].valid_min == limits.valid_max

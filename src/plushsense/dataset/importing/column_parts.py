@@ -414,7 +414,7 @@ def _measured(column: SampledColumn, guess: PatternDraft) -> dict[str, Any]:
     largest = float(np.abs(values).max())
     # A magnitude needs a range; twice the largest value is a guess at that of the sensor.
     limit = float(2 ** int(np.ceil(np.log2(max(2 * largest, 1.0)))))
-    # Whole numbers of steps have to fit 32 bits; those of a vector a self-calibration, and the square of a magnitude 64.
+    # Whole numbers of steps have to fit 32 bits; those of a vector a self-calibration, and their squares 64 bits.
     highest, most = (largest, _MOST_STEPS) if kind == "sensor" else (limit, MOST_CALIBRATED)
     while digits and highest * 10**digits > most:
         digits -= 1
