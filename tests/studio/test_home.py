@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from plushsense.dataset.privacy.removed import remember_removed
+from plushsense.models.bundle import Bundle
 from plushsense.studio.app.workspace import DATASETS, Workspace
 from support.browsing import DESK, LONG_MS, TABLET, axe, marked
 from support.bundles import odd_bundle
@@ -229,3 +232,22 @@ def test_everything_is_saved_in_one_file_and_opened_where_nothing_is_replaced(
     page.wait_for_function("() => document.querySelectorAll('[data-test=dataset]').length === 2")
     assert sorted(p.name for p in (few / "datasets").iterdir() if p.is_dir()) == ["virtual", "virtual 2"]
     assert [p.name for p in (few / "bundles").iterdir()] == ["net.plush"]
+    # A person who was removed comes back after a question only, by the data sets as by a network.
+    remember_removed(few, "P01")
+    network = Bundle.load(few / "bundles" / "net.plush")
+    network = replace(network, provenance={**network.provenance, "subjects": ["P01"]})
+    network.save(tmp_path / "of P01.plush")
+    for answer, datasets, networks in (("ask-other", 2, 1), ("ask-go", 3, 2)):
+        for chosen in (file, tmp_path / "of P01.plush"):
+            with page.expect_file_chooser() as chooser:
+                marked(page, "choose_files").click()
+            chooser.value.set_files(chosen)
+            question = marked(page, "ask").filter(has_text="P01 was removed")
+            question.wait_for()
+            if answer == "ask-other" and chosen != file:
+                question.get_by_role("button", name="Cancel").click()
+            else:
+                marked(page, answer).click()
+            question.wait_for(state="detached")
+        page.wait_for_function(f"() => document.querySelectorAll('[data-test=dataset]').length === {datasets}")
+        assert len(list((few / "bundles").iterdir())) == networks

@@ -43,6 +43,7 @@ def test_a_project_holds_data_and_networks_and_replaces_nothing(tmp_path: Path) 
     # A person who was removed there does not come back by it.
     remember_removed(other, "P01")
     assert [name for name, _ in open_project(saved, other).refused] == ["virtual.zip"]
+    assert open_project(saved, other, readmit=True).datasets == ("virtual 3",)
 
 
 def test_a_hostile_project_is_refused_part_by_part(tmp_path: Path) -> None:

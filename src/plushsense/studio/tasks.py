@@ -325,7 +325,7 @@ def _save(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 def _open(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Open the project ``file`` in the studio's folder ``home``."""
-    done = open_project(spec["file"], spec["home"], reporter.count)
+    done = open_project(spec["file"], spec["home"], reporter.count, readmit=spec["readmit"])
     rejected = [{"file": name, "reason": why} for name, why in done.refused]
     return {"datasets": done.datasets, "networks": done.networks, "rejected": rejected}
 

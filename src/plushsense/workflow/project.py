@@ -108,6 +108,7 @@ def open_project(
     home: str | Path,
     progress: Progress = lambda done, total: None,
     limits: UnpackLimits | None = None,
+    readmit: bool = False,
 ) -> ProjectResult:
     """Restore the data sets of a project as new ones in ``home``, and add its networks; nothing there is changed.
 
@@ -116,6 +117,7 @@ def open_project(
     Args:
         progress: called with (parts done, number of parts).
         limits: limits for the whole and for each data set.
+        readmit: whether to open parts of people who were removed from ``home``.
 
     Raises:
         DatasetError: for a file that is no project, or is larger than the limits. OSError: for errors of the disk.
@@ -132,9 +134,9 @@ def open_project(
             progress(done, len(members))
             try:
                 if part.parent.name == DATASETS:
-                    datasets.append(_restore(part, place / DATASETS, limits))
+                    datasets.append(_restore(part, place / DATASETS, limits, readmit))
                 else:
-                    networks.append(_add(part, place / BUNDLES))
+                    networks.append(_add(part, place / BUNDLES, readmit))
             except PlushSenseError as refusal:
                 refused.append((part.name, refusal.message))
         progress(len(members), len(members))
@@ -156,9 +158,9 @@ def _unused(path: Path) -> Path:
     return free
 
 
-def _restore(part: Path, datasets: Path, limits: UnpackLimits | None) -> str:
+def _restore(part: Path, datasets: Path, limits: UnpackLimits | None, readmit: bool) -> str:
     dest = _unused(datasets / part.stem)
-    restore(part, dest, limits=limits)
+    restore(part, dest, limits=limits, readmit=readmit)
     taken = {DatasetHead.read(head.parent).name for head in datasets.glob(f"*/{HEAD}") if head.parent != dest}
     head = DatasetHead.read(dest)
     if head.name in taken:
@@ -166,10 +168,12 @@ def _restore(part: Path, datasets: Path, limits: UnpackLimits | None) -> str:
     return dest.name
 
 
-def _add(part: Path, bundles: Path) -> str:
+def _add(part: Path, bundles: Path, readmit: bool) -> str:
     if part.suffix != ".plush":
         raise BundleError("'{path}' is no network.", path=part)
-    refuse_removed(bundles, known_people(Bundle.load(part).provenance))
+    people = known_people(Bundle.load(part).provenance)
+    if not readmit:
+        refuse_removed(bundles, people)
     place = free_path(bundles / part.name, content := part.read_bytes())
     if not place.exists():
         bundles.mkdir(parents=True, exist_ok=True)

@@ -95,17 +95,22 @@ def may_be_suggested(home: Path, code: str) -> bool:
         return False
 
 
-def refuse_removed(place: Path, people: Iterable[str]) -> None:
-    """Raise DatasetError if one of ``people`` was removed from the home that ``place`` lies in."""
+def removed_of(place: Path, people: Iterable[str]) -> list[str]:
+    """Return those of ``people`` who were removed from the home that ``place`` lies in."""
     home = remembers_removed(place)
     if home is None:
-        return
+        return []
     removed = RemovedCodes.read(home)
-    if back := sorted({code for code in people if code in removed}):
+    return sorted({code for code in people if code in removed})
+
+
+def refuse_removed(place: Path, people: Iterable[str]) -> None:
+    """Raise DatasetError if one of ``people`` was removed from the home that ``place`` lies in."""
+    if back := removed_of(place, people):
         raise DatasetError(
             "{people} was removed from '{home}' for good: take recordings of this code in again only if the person "
             "agreed anew, or if it is somebody else (--readmit; Python: readmit=True).",
             people=join_names(back),
-            home=home,
+            home=remembers_removed(place),
             needs=CONSENT,
         )

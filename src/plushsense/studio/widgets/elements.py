@@ -119,17 +119,31 @@ def open_dialog(label: str, name: str, classes: str = "") -> Iterator[ui.dialog]
     dialog.open()
 
 
-def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: str = "", value: str = "") -> None:
+def ask(
+    words: Words,
+    title: str,
+    go: str,
+    answer: Callable[[str], Any],
+    label: str = "",
+    value: str = "",
+    other: tuple[str, Callable[[], Any]] | None = None,
+) -> None:
     """Ask a question in a dialog; if the button with the text ``go`` is clicked, call ``answer``, which may be async.
 
     Args:
         label, value: name of a text field, whose content ``answer`` gets, and what it holds at first; without a label
             there is no field.
+        other: text and effect of a further button.
     """
 
     async def done() -> None:
         dialog.close()
         await on_page(answer)(str(field.value or "").strip() if field is not None else "")
+
+    async def done_otherwise() -> None:
+        dialog.close()
+        if other:
+            await on_page(other[1])()
 
     field: ui.input | None = None
     with open_dialog(title, "ask") as dialog:
@@ -139,11 +153,18 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
             on_enter(field, done)
         with ui.row().classes("w-full justify-end"):
             button("", words("Cancel"), dialog.close, "flat" if label else "flat autofocus")
+            if other:
+                button("ask-other", other[0], done_otherwise, "outline")
             button("ask-go", go, done, "unelevated" if label else "outline")
 
 
-async def admitting(page: Page, work: Callable[[bool], Any]) -> bool:
+async def admitting(
+    page: Page, work: Callable[[bool], Any], other: tuple[str, Callable[[], Any]] | None = None
+) -> bool:
     """Call ``work(False)``; if people would come back who were removed, ask, and then call ``work(True)``.
+
+    Args:
+        other: text and effect of a further button of the question.
 
     Returns:
         Whether the work is done; otherwise it was refused, or the question is open.
@@ -158,7 +179,7 @@ async def admitting(page: Page, work: Callable[[bool], Any]) -> bool:
             if refusal.message.values.get("needs") != CONSENT:
                 raise
             go_on = words("Take them in anyway")
-            ask(words, words.error(refusal), go_on, lambda _: admitting(page, lambda _: work(True)))
+            ask(words, words.error(refusal), go_on, lambda _: admitting(page, lambda _: work(True)), other=other)
     return False
 
 

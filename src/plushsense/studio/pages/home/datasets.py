@@ -22,6 +22,7 @@ from plushsense.studio.pages.home.sections import (
     SMALL,
     FileActions,
     findings_text,
+    open_project_file,
     page_links,
     simulation_badge,
     titled_card,
@@ -120,8 +121,7 @@ class DatasetSection:
 
         workspace = self._page.workspace
         if is_project(path):
-            opening = {"file": str(path), "home": str(workspace.folder), "name": path.stem}
-            self._jobs.start("open", opening, self._page.words("Opening “{name}”", name=path.stem))
+            await open_project_file(self._page, self._jobs, path)
             return
         if not readmit:
             refuse_removed(path, await run.io_bound(backup_people, path) or ())

@@ -6,6 +6,7 @@ import shutil
 import uuid
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -23,7 +24,7 @@ from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Message
 from plushsense.dataset.files import DATASETS, person_folders
 from plushsense.dataset.importing.archives import UnpackLimits, member_target
-from plushsense.dataset.privacy.removed import CONSENT, refuse_removed
+from plushsense.dataset.privacy.removed import CONSENT, refuse_removed, removed_of
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
 from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
@@ -31,8 +32,8 @@ from plushsense.studio.app.shell import Page, button, heading, on_change, on_pag
 from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BACKUPS, BUNDLES, PATTERNS, WORK, Workspace, plain_name
 from plushsense.studio.pages.home.mapping import FileMapping, MappingPanel
-from plushsense.studio.pages.home.sections import simulation_badge, titled_card
-from plushsense.studio.widgets.elements import MAX_LINES, errors_beside, facts, folded_lines, notice
+from plushsense.studio.pages.home.sections import open_project_file, simulation_badge, titled_card
+from plushsense.studio.widgets.elements import MAX_LINES, admitting, errors_beside, facts, folded_lines, notice
 
 _LAYOUTS: Texts = {
     "plush-15": "plush toy",
@@ -81,6 +82,8 @@ class Incoming:
         """Names of the networks that were added."""
         self.projects: list[Path] = []
         """Projects that were uploaded, now among the backups."""
+        self.returning: list[Path] = []
+        """Uploaded networks that know a person who was removed: ask before `add_network`."""
         self._names: list[str] = []
         self._count = self._bytes = self._tries = 0
 
@@ -133,7 +136,7 @@ class Incoming:
         await run.io_bound(lambda: place.parent.mkdir(parents=True, exist_ok=True))
         await file.save(place)
         if kind == ".plush":
-            await run.io_bound(self._add_bundle, place)
+            await run.io_bound(self.add_network, place)
         elif kind == ".zip" and await run.io_bound(self._add_project, place):
             return
         else:
@@ -152,15 +155,20 @@ class Incoming:
         self.projects.append(place)
         return True
 
-    def _add_bundle(self, stored: Path) -> None:
+    def add_network(self, stored: Path, readmit: bool = False) -> None:
         """Check an uploaded network, and move it to the networks of the studio."""
-        from plushsense.models.bundle import Bundle
+        from plushsense.models.bundle import Bundle, known_people
 
         name = plain_name(stored.stem, "network")
         try:
             if stored.stat().st_size > BUNDLE_BYTES:
                 raise ConfigError("a network has at most {mb} MB", mb=f"{BUNDLE_BYTES / 1e6:g}")
-            Bundle.load(stored)
+            people = known_people(Bundle.load(stored).provenance)
+            if not readmit and removed_of(stored, people):
+                aside = self.folder / "returning" / stored.name
+                aside.parent.mkdir(exist_ok=True)
+                self.returning.append(stored.rename(aside))
+                return
             place = self._workspace.new(BUNDLES, f"{name}.plush")
             place.parent.mkdir(parents=True, exist_ok=True)
             stored.rename(place)
@@ -295,18 +303,31 @@ class IncomingSection:
                 broken_off = words("The upload broke off. Nothing was imported. Try again.")
                 page.say(cancelled if end["cancelled"] else broken_off, "warning")
             return
-        added, incoming.bundles = incoming.bundles, []
-        if added:
-            page.say(words("The network “{name}” is added.", name="”, “".join(added)), "good")
-            await self._refresh()
+        await self._say_added()
         if refused:
             page.say(" ".join(words.sentence(note) for note in refused[:MAX_LINES]), "error")
         projects, incoming.projects = incoming.projects, []
         for project in projects:
-            spec = {"file": str(project), "home": str(page.workspace.folder), "name": project.stem}
-            self._jobs.start("open", spec, words("Opening “{name}”", name=project.stem))
+            await open_project_file(page, self._jobs, project)
+        returning, incoming.returning = incoming.returning, []
+        for stored in returning:
+            await admitting(page, partial(self._add_returning, stored))
         if incoming.sources:
             self._inspect()
+
+    async def _say_added(self) -> None:
+        added, self._incoming.bundles = self._incoming.bundles, []
+        if added:
+            self._page.say(self._words("The network “{name}” is added.", name="”, “".join(added)), "good")
+            await self._refresh()
+
+    async def _add_returning(self, stored: Path, readmit: bool) -> None:
+        from plushsense.models.bundle import Bundle, known_people
+
+        if not readmit:
+            refuse_removed(stored, known_people(Bundle.load(stored).provenance))
+        self._incoming.add_network(stored, readmit)
+        await self._say_added()
 
     # Preview --------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from nicegui import ui
+from nicegui import run, ui
 
 from plushsense.dataset.files import person_folders
 from plushsense.dataset.privacy.removed import refuse_removed
@@ -167,6 +167,26 @@ def findings_text(page: Page, result: dict[str, Any]) -> str:
         warnings=counts.get("warning", 0),
         notes=counts.get("info", 0),
     )
+
+
+async def open_project_file(page: Page, jobs: Jobs, path: Path) -> None:
+    """Start to open a project; ask before if people would come back who were removed."""
+    from plushsense.workflow.project import project_people
+
+    words = page.words
+
+    def begin(readmit: bool) -> None:
+        spec = {"file": str(path), "home": str(page.workspace.folder), "name": path.stem, "readmit": readmit}
+        with page.show_errors():
+            jobs.start("open", spec, words("Opening “{name}”", name=path.stem))
+            page.show_work()
+
+    async def check(readmit: bool) -> None:
+        if not readmit:
+            refuse_removed(path, await run.io_bound(project_people, path) or ())
+        begin(readmit)
+
+    await admitting(page, check, (words("Open without them"), lambda: begin(False)))
 
 
 async def put_away(
