@@ -239,6 +239,7 @@ STAND_INS = {
     r"^(adapt \S+) RECORDINGS": r"\1 SESSION",
     r" m\.plush": " model.plush",
     r"by-subject:5": "by-subject:2",
+    r"--people 3,6": "--people 1",
     r"/(safe/place|somewhere/safe)/": "",
     r"--samples 100000": "--samples 500",
     r"--merges 2": "--groups plush-13",

@@ -161,6 +161,25 @@ def test_evaluate_goes_on_where_it_stood(cli: Cli, dataset: Dataset) -> None:
     assert "from before" not in other.err
 
 
+def test_a_learning_curve_stands_beside_the_evaluation(cli: Cli, dataset: Dataset) -> None:
+    ran = cli("evaluate", dataset.path, *SMALL, "--people", "1,2,4", "--json")
+    curve = ran.json["learning"]
+    assert [point["people"] for point in curve["points"]] == [1, 2, 4] and curve["more"] == 3
+    # The folds themselves are trained on four people, and not again.
+    assert curve["points"][-1]["accuracy"] == pytest.approx(ran.json["accuracy"]["mean"])
+    sentence = "Training with 3 more people would change the accuracy by"
+    assert sentence in Path(ran.json["report"]).read_text(encoding="utf-8")
+    shown = cli("evaluate", dataset.path, *SMALL, "--people", "2").out
+    assert "people trained on" in shown and sentence in shown
+    for wrong, split, why in (
+        ("5", "leave-one-subject-out", "is trained on 4"),
+        ("4", "leave-one-subject-out", "is trained on 4"),
+        ("1", "by-recording:2", "leaves people out"),
+    ):
+        refused = cli("evaluate", dataset.path, *SMALL, "--people", wrong, "--split", split)
+        assert refused.status != 0 and why in refused.err
+
+
 def test_trained_on_loops_scored_on_the_stream(cli: Cli, dataset: Dataset) -> None:
     found = cli("evaluate", dataset.path, *SMALL, "--train-context", "loop", "--json").json
     assert (found["train_context"], found["context"]) == ("loop", "stream")

@@ -13,7 +13,7 @@ from plushsense.core.errors import BuildError, ConfigError, ProgramError, ToolEr
 from plushsense.deploy.targets import TARGETS, CompileSpec, build, missing_tools, require, target_named
 
 BARE = [name for name, target in TARGETS.items() if target.counts]  # with start-up code of our own
-WITH_BLOBS = [name for name, target in TARGETS.items() if not target.emulator]
+WITH_BLOBS = [name for name, target in TARGETS.items() if target.runtime and not target.emulator]
 Here = Callable[[str], str]
 
 ECHO = """
@@ -168,7 +168,10 @@ def test_a_program_that_hangs_is_stopped(target: str, tmp_path: Path, target_her
         build(target_here(target), [source], tmp_path).run(timeout_s=0.3)
 
 
-@pytest.mark.parametrize("target", [name for name in TARGETS if name != "tcc"])  # it has words of its own
+COMPILED = [name for name, target in TARGETS.items() if target.runtime and name != "tcc"]  # it has words of its own
+
+
+@pytest.mark.parametrize("target", COMPILED)
 def test_what_a_compiler_refuses(target: str, tmp_path: Path, target_here: Here) -> None:
     target_here(target)
     with pytest.raises(BuildError, match="refused main.c: .*error: expected expression") as refusal:

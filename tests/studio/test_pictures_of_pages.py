@@ -6,8 +6,6 @@ function in `SCENES`: it gets the open page, has something happen on it, and ret
 
 from __future__ import annotations
 
-import io
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,18 +16,28 @@ import pytest
 
 from plushsense.studio.app.shell import PAGES
 from plushsense.studio.app.workspace import Workspace
-from support.browsing import DESK, LONG_MS, PHONE, TABLET, Look, Studio, axe, connected, english, marked
+from support.browsing import (
+    DESK,
+    KEPT,
+    LONG_MS,
+    PHONE,
+    TABLET,
+    Look,
+    Studio,
+    axe,
+    connected,
+    english,
+    keep_picture,
+    marked,
+)
 from support.recorded import record
 from support.recording_pages import begun, sat, showing
-from support.requirements import missing
 from support.sharing import built_once
 from support.trainings import evaluate_apart
 
 pytestmark = pytest.mark.early
 
 Fixture = Callable[..., Any]
-KEPT = os.environ.get("PLUSHSENSE_SHOTS", "")
-MOST_BYTES = 100_000
 
 
 @dataclass(frozen=True)
@@ -184,20 +192,6 @@ def furnished(furniture: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     one.stop()
 
 
-def small(png: bytes, width: int) -> bytes:
-    """The picture as few bytes: a palette, and no wider than ``width``."""
-    try:
-        from PIL import Image
-    except ImportError:
-        missing("pictures", "pillow is not installed, and the pictures for the README are to be small")
-    picture = Image.open(io.BytesIO(png)).convert("RGB")
-    if picture.width > width:
-        picture = picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
-    out = io.BytesIO()
-    picture.quantize(192, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
-    return out.getvalue()
-
-
 def test_every_page_has_a_scene() -> None:
     assert list(SCENES) == list(PAGES)
 
@@ -228,8 +222,6 @@ def test_a_page_reads_well(name: str, view: View, furnished: Studio, look: Fixtu
         marked(page, "stop").click()
         marked(page, "start").wait_for()
     assert browser.complaints == []
-    if KEPT:
-        kept = small(png, 960 if view.size[0] > view.size[1] else 615 if view.size == TABLET else 390)
-        assert len(kept) <= MOST_BYTES, f"{name}-{view.name}.png has {len(kept)} bytes"
-        Path(KEPT).mkdir(parents=True, exist_ok=True)
-        (Path(KEPT) / f"{name}-{view.name}.png").write_bytes(kept)
+    keep_picture(
+        png, f"{name}-{view.name}", 960 if view.size[0] > view.size[1] else 615 if view.size == TABLET else 390
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import io
 import json
 import multiprocessing
 import os
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
 from plushsense.studio.app.shell import PAGES
+from support.requirements import missing
 
 if TYPE_CHECKING:
     from playwright.sync_api import BrowserContext, ConsoleMessage, Page, Request
@@ -44,6 +46,8 @@ CHROMIUM = [
 ]
 # What Chromium says of a message that a page sends just when its connection is closed, as on leaving the page.
 _CLOSED = "WebSocket is already in CLOSING or CLOSED state."
+KEPT = os.environ.get("PLUSHSENSE_SHOTS", "")
+_PICTURE_BYTES = 100_000
 _PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 _START_S = 120.0
 _WAIT_MS = 120_000
@@ -317,3 +321,26 @@ def in_sight(page: Page, name: str) -> bool:
 def marked(page: Page, name: str) -> Any:
     """The element that the code marks with ``.mark(name)`` (`plushsense.studio.app.shell.tag`)."""
     return page.locator(f'[data-test="{name}"]')
+
+
+def keep_picture(png: bytes, name: str, width: int) -> None:
+    """Keep a picture for the documentation in the folder ``PLUSHSENSE_SHOTS``, if set."""
+    if KEPT:
+        kept = _small(png, width)
+        assert len(kept) <= _PICTURE_BYTES, f"{name}.png has {len(kept)} bytes"
+        Path(KEPT).mkdir(parents=True, exist_ok=True)
+        (Path(KEPT) / f"{name}.png").write_bytes(kept)
+
+
+def _small(png: bytes, width: int) -> bytes:
+    """The picture as few bytes: a palette, and no wider than ``width``."""
+    try:
+        from PIL import Image
+    except ImportError:
+        missing("pictures", "pillow is not installed, and the pictures for the README are to be small")
+    picture = Image.open(io.BytesIO(png)).convert("RGB")
+    if picture.width > width:
+        picture = picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
+    out = io.BytesIO()
+    picture.quantize(192, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
+    return out.getvalue()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, say_advice, settings
 from plushsense.core.errors import ConfigError
+from plushsense.core.files import write_file
 from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
@@ -18,8 +21,9 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
     from plushsense.workflow.api import FoldsSpec, evaluate_run
+    from plushsense.workflow.learning import check_sizes, measure_curve
     from plushsense.workflow.preparation import prepare
-    from plushsense.workflow.reporting import PAGE, write_report
+    from plushsense.workflow.reporting import LEARNING, PAGE, write_report
 
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
     if args.save_windows:
@@ -32,11 +36,20 @@ def run(args: argparse.Namespace) -> int:
         return 0
     dataset = open_dataset(args.dataset)
     made = prepare(dataset, config, warn)
+    most = check_sizes(made, args.people) if args.people else 0
     out = Path(args.out) if args.out else dataset.path / "evaluations" / made.name
     spec = FoldsSpec(out, args.force, args.cluster, args.int8)
     result = evaluate_run(made, spec, progress=report_jobs("evaluating"), warn=warn)
-    report = write_report(out / PAGE, dataset, [out])
-    content = {**result.to_json(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
+    content = {**result.to_json(), "out": str(out), "simulated": dataset.head.simulated}
+    if args.people:
+        curve = measure_curve(made, result, most, args.people, args.cluster, report_jobs("learning curve"))
+        if curve is None:
+            warn("No learning curve: it needs two numbers of people to train on, and three people left out.")
+        else:
+            content["learning"] = curve.to_json()
+            with dataset.generation.writing():
+                write_file(out / LEARNING, json.dumps(curve.to_json()))
+    content["report"] = str(write_report(out / PAGE, dataset, [out]))
     say(f"written: {out}")
     emit(args, content, lines(content))
     say_advice(args.dataset)
@@ -45,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 def lines(e: dict[str, Any]) -> list[str]:
     """Format the scores of an evaluation as text: a row for each person, then the means."""
-    from plushsense.reports.wording import describe_leakage
+    from plushsense.reports.wording import describe_leakage, describe_learning
     from plushsense.scoring.metrics import METRICS, column_metrics
 
     names = {key: metric.name for key, metric in column_metrics().items()}
@@ -82,7 +95,14 @@ def lines(e: dict[str, Any]) -> list[str]:
         out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({plural(part['windows'], 'window')})")
     if "leakage" in e:
         out.append(describe_leakage(e["leakage"]))
+    if curve := e.get("learning"):
+        rows = [(point["people"], figure(point["accuracy"]), _interval(point["ci95"])) for point in curve["points"]]
+        out += ["", table(("people trained on", "accuracy", "95 % interval"), rows), describe_learning(curve)]
     return out + (deployed(e["int8"]) if "int8" in e else [])
+
+
+def _interval(ci95: Sequence[float] | None) -> str:
+    return "-" if ci95 is None else f"{ci95[0]:.3f} to {ci95[1]:.3f}"
 
 
 def deployed(e: dict[str, Any]) -> list[str]:

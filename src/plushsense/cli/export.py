@@ -201,9 +201,22 @@ def format_profile(profile: Profile) -> list[str]:
         f"{arch.title}: a step is {arch.step} samples, {profile.step_ms:g} ms; compiled with {profile.optimise}",
         f"  MACs a step  {arch.macs_per_step:,} ({layers})",
         *_counts(profile),
-        "",
-        *_bytes(list(profile.costs.values())),
+        *(["", *_bytes(list(profile.costs.values()))] if profile.costs else []),
         *_times(profile),
+        *_web(profile),
+    ]
+
+
+def _web(profile: Profile) -> list[str]:
+    if (web := profile.web) is None:
+        return []
+    return [
+        "",
+        "In a browser",
+        f"  module            {web.module_bytes:,} bytes; {web.memory_bytes:,} bytes of memory while it runs",
+        f"  script            {web.script_bytes:,} bytes",
+        f"  page of one file  {web.page_bytes:,} bytes",
+        f"  a step            {web.step_us:.1f} µs in Node on this computer, by way of plushsense.js",
     ]
 
 

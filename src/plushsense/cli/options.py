@@ -31,7 +31,12 @@ def seed(text: str) -> int:
     return value
 
 
-_TYPES = {"int": int, "float": float, "seed": seed}
+def numbers(text: str) -> tuple[int, ...]:
+    """Convert whole numbers with commas between them; raise ValueError for others."""
+    return tuple(map(int, text.split(",")))
+
+
+_TYPES = {"int": int, "float": float, "numbers": numbers, "seed": seed}
 
 
 class _Words(dict[str, str]):

@@ -14,7 +14,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, LayoutError
+from plushsense.core.errors import BadInput, LayoutError, ToolError
 from plushsense.core.files import new_folder, read_bytes
 from plushsense.core.layouts import ACCELERATION, DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.core.templates import c_comment, fill_text
@@ -36,6 +36,8 @@ from plushsense.deploy.code import (
 )
 from plushsense.deploy.convert import CONVERTERS, convert
 from plushsense.deploy.golden import measured, write_golden
+from plushsense.deploy.wasm import module
+from plushsense.deploy.web import web_files
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
@@ -80,11 +82,14 @@ _TEMPLATES = {
 }
 
 
-def export_files(bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes]) -> dict[str, bytes]:
-    """Return the contents of the files of an export, by their paths: its code, README, and packages for build systems.
+def export_files(
+    bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes], wasm: bytes | None = None
+) -> dict[str, bytes]:
+    """Return the contents of the files of an export, by their paths: its code, README, packages for build systems, web.
 
     The packages are an Arduino library, an ESP-IDF component, a CMake project and a Zephyr module. ``code`` holds the
-    library and the model without the name of the export (`plushsense.deploy.code.code_files`).
+    library and the model without the name of the export (`plushsense.deploy.code.code_files`), and ``wasm`` is the
+    WebAssembly module, without which there is no page.
 
     Raises:
         LayoutError: for a layout with values that the toy's line format cannot represent.
@@ -131,7 +136,8 @@ def export_files(bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes]) -
     texts |= {f"{ARDUINO}/src/{file}": text for file, text in own.items()}
     texts |= {f"{IDF}/{_component_path(file)}": text for file, text in own.items()}
     contents = {file: prefixed(text, name).encode() for file, text in (own | {IMAGE: ""} | texts).items()}
-    return {_named_path(file, name): content for file, content in (contents | {IMAGE: code[IMAGE]}).items()}
+    named = {_named_path(file, name): content for file, content in (contents | {IMAGE: code[IMAGE]}).items()}
+    return named | web_files(bundle, facts, code[IMAGE], wasm)
 
 
 def _component_path(name: str) -> str:
@@ -380,10 +386,14 @@ def _statistics(layout: Layout, scaler: Scaler, readings: Readings | None) -> li
 
 @dataclass(frozen=True)
 class ExportResult:
-    """Result of an export; ``files`` are relative to ``folder``, the sizes as in `ModelFacts`."""
+    """Result of an export; ``files`` are relative to ``folder``, the sizes as in `ModelFacts`.
+
+    ``no_page``: why there is no page, as a sentence; empty if there is one.
+    """
 
     folder: Path
     facts: ModelFacts
+    no_page: str = ""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -435,14 +445,18 @@ def emit(
     """
     check_names(name, url=url)
     bundle = bundle.without_people()
-    code = code_files(model, bundle)
+    code, web, no_page = code_files(model, bundle), None, ""
+    try:
+        web = module(calibrate=bool(model.layout.self_calibration))
+    except ToolError as cause:
+        no_page = str(cause)
     with new_folder(out, BadInput) as part:
         conversions = {}
         for other in dict.fromkeys(also):
             done = convert(bundle, part / CONVERTERS[other].file_name, other, windows=windows)
             conversions[other] = ConversionFacts(done.path.name, done.bytes, done.largest_difference, done.notes)
         facts = replace(facts_of(model, bundle, code[IMAGE]), name=name, url=url, conversions=conversions)
-        for file, content in export_files(bundle, facts, code).items():
+        for file, content in export_files(bundle, facts, code, web).items():
             (part / file).parent.mkdir(parents=True, exist_ok=True)
             (part / file).write_bytes(content)
         bundle.save(part / BUNDLE)
@@ -451,4 +465,4 @@ def emit(
         facts = replace(facts, files=tuple(sorted({*files, FACTS})))
         text = json.dumps(facts.to_json(), indent=1, ensure_ascii=False)
         (part / FACTS).write_text(text + "\n", "utf-8", newline="\n")
-    return ExportResult(out, facts)
+    return ExportResult(out, facts, no_page)

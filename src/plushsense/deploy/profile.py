@@ -13,8 +13,8 @@ import numpy as np
 
 from plushsense.core.errors import BadInput, ConfigError, ProgramError, ToolError, check_known
 from plushsense.core.toml import load_table, read_toml
-from plushsense.deploy.code import GOLDEN, LIBRARY, MODEL, ModelFacts
-from plushsense.deploy.golden import read_golden
+from plushsense.deploy.code import GOLDEN, IMAGE, LIBRARY, MODEL, ModelFacts
+from plushsense.deploy.golden import Vectors, read_golden
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.targets import (
     C_FOLDER,
@@ -27,6 +27,7 @@ from plushsense.deploy.targets import (
     tool,
     tool_output,
 )
+from plushsense.deploy.web import MODULE, WASM, WebCost, web_cost
 from plushsense.models.arch import Arch
 from plushsense.runtime.fixed import Ints
 
@@ -434,7 +435,8 @@ SUMMARY = (
 class Profile:
     """Costs by target, and estimates for the cores whose target was counted.
 
-    ``missing`` maps each target that is not installed to the Debian packages that it needs.
+    ``missing`` maps each target that is not installed to the Debian packages that it needs. ``web`` is the cost of the
+    module, if that was asked for.
     """
 
     facts: ModelFacts
@@ -443,6 +445,7 @@ class Profile:
     costs: Mapping[str, Cost]
     estimates: Mapping[str, Estimate]
     missing: Mapping[str, Sequence[str]]
+    web: WebCost | None = None
 
     @property
     def step_ms(self) -> float:
@@ -486,6 +489,7 @@ class Profile:
             "estimated_window_instructions": self.window_instructions,
             "targets": {name: c.to_json() for name, c in self.costs.items()},
             "missing": {name: list(packages) for name, packages in self.missing.items()},
+            **({WASM: vars(self.web)} if self.web else {}),
         }
 
 
@@ -501,7 +505,8 @@ def profile(
 
     Args:
         folder: the folder that ``plushsense export`` wrote.
-        targets: names of `TARGETS` that count instructions, or "host"; by default all of the former that are installed.
+        targets: names of `TARGETS` that count instructions, "host" or "wasm"; by default all of the former that are
+            installed.
         optimise: optimisation flag of the compilers.
         trust: whether to compile and run code in a folder with files that differ from what this version writes.
         progress: called with (targets done, number of targets).
@@ -519,7 +524,7 @@ def profile(
         export.require_unchanged()
     counting = [name for name, target in TARGETS.items() if target.counts]
     for name in targets:
-        check_known(name, [*counting, "host"], "target to profile", ConfigError)
+        check_known(name, [*counting, "host", WASM], "target to profile", ConfigError)
     names = list(dict.fromkeys(targets)) or counting
     missing = {name: lacks for name in names if (lacks := missing_tools(name))}
     if targets:
@@ -533,11 +538,14 @@ def profile(
             "--target host for sizes on this computer only.",
             packages=packages,
         )
-    costs = {}
+    costs, web = {}, None
     with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as work:
         code = export.code(Path(work) / "code")
         for done, name in enumerate(installed):
             progress(done, len(installed))
+            if name == WASM:
+                web = _web(export, Path(work), code / IMAGE)
+                continue
             costs[name] = count(folder, name, facts, optimise, code=code)
     progress(len(installed), len(installed))
     estimates = {
@@ -545,7 +553,16 @@ def profile(
         for core in cores()
         if core.target in costs and (found := estimate(core, costs[core.target], arch, facts.step_ms))
     }
-    return Profile(facts, arch, optimise, costs, estimates, missing)
+    return Profile(facts, arch, optimise, costs, estimates, missing, web)
+
+
+def _web(export: Export, work: Path, image: Path) -> WebCost:
+    if not export.has_module:
+        raise BadInput("The export '{path}' lacks {file}: export the model again.", path=export.folder, file=MODULE)
+    even, _, _ = _streams(export.folder, export.facts)
+    cases = work / "cases.bin"
+    cases.write_bytes(Vectors("even", even, np.empty((0, 0), np.int32), len(even)).to_bytes())
+    return web_cost(export.folder, image, cases)
 
 
 FLOAT_MMAC_S = 58.0

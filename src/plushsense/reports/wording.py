@@ -75,13 +75,7 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         answers.append(("At rest", rest))
     learning = evaluation.get("learning")
     if learning and learning.get("ci95"):
-        low, high = learning["ci95"]
-        people = ", ".join(str(point["people"]) for point in learning["points"])
-        more = (
-            f"Training with {learning['more']} more people would change the accuracy by {learning['gain']:+.3f} (95 % "
-            f"interval {low:+.3f} to {high:+.3f}), by a learning curve over {people} people to train on."
-        )
-        answers.append(("More people", more))
+        answers.append(("More people", describe_learning(learning)))
     if not evaluation.get("leaky"):
         audit = evaluation.get("leakage") or {}
         shared = audit.get("overlapping", 0) / max(audit.get("windows", 0), 1)
@@ -92,6 +86,16 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
     if audit := evaluation.get("leakage"):
         answers.append(("Leakage audit", describe_leakage(audit)))
     return answers
+
+
+def describe_learning(learning: Mapping[str, Any]) -> str:
+    """Describe a learning curve (`plushsense.workflow.learning`) in one sentence."""
+    low, high = learning["ci95"]
+    people = ", ".join(str(point["people"]) for point in learning["points"])
+    return (
+        f"Training with {learning['more']} more people would change the accuracy by {learning['gain']:+.3f} (95 % "
+        f"interval {low:+.3f} to {high:+.3f}), by a learning curve over {people} people to train on."
+    )
 
 
 def describe_leakage(audit: Mapping[str, Any]) -> str:

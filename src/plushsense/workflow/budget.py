@@ -18,8 +18,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from plushsense.core.errors import PlushSenseError, python_warning
 from plushsense.core.files import free_path, write_file
 from plushsense.dataset.index import as_dataset
@@ -27,18 +25,17 @@ from plushsense.dataset.store import Dataset
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
-from plushsense.scoring.metrics import summary
 from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import FoldsSpec, evaluate_run, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.estimate import preview_evaluation
+from plushsense.workflow.learning import LearningCurve, accuracies, learning_curve
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import Run, Warn, count_people, prepare, refits, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, journal_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
-MORE_PEOPLE = 2
 _KNOWN_PEOPLE = "by-recording:5"
 _FEWEST_FOLDS, _FOLDS = 3, (10, 5)
 _FEWEST_EPOCHS = 10
@@ -140,54 +137,6 @@ def plan_s(cost: TrainingCost, plan: BudgetPlan) -> float:
     """Estimate the seconds that a plan takes."""
     shares = [1.0, *(size / plan.trained_people for size in plan.sizes)]
     return cost.training_s(plan.epochs) + sum(cost.evaluation_s(plan.epochs, plan.folds, s) for s in shares)
-
-
-@dataclass(frozen=True)
-class LearningCurve:
-    """How the accuracy grows with the number of people to train on.
-
-    Attributes:
-        points: (number of people, mean accuracy), ascending.
-        more: number of further people.
-        gain: what they would add to the accuracy, with its 95 % interval ``ci95``.
-    """
-
-    points: tuple[tuple[int, float], ...]
-    more: int
-    gain: float
-    ci95: tuple[float, float]
-
-    def to_json(self) -> dict[str, object]:
-        """Return plain values, ready for JSON."""
-        points = [{"people": people, "accuracy": accuracy} for people, accuracy in self.points]
-        return asdict(self) | {"points": points, "ci95": list(self.ci95)}
-
-
-def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int = MORE_PEOPLE) -> LearningCurve | None:
-    """Estimate from a learning curve what ``more`` people to train on would add to the accuracy.
-
-    For each person, a line is fitted to the accuracy over the logarithm of the number of training people. The gain is
-    the mean slope, times the step of the logarithm; its 95 % interval is a bootstrap over the people.
-
-    Args:
-        points: accuracy of each person, by the number of people that were trained on.
-
-    Returns:
-        the curve; None with fewer than two sizes or three people, from which no uncertainty follows.
-    """
-    sizes = sorted(points)
-    people = [p for p in points[sizes[-1]] if all(points[m].get(p) is not None for m in sizes)] if sizes else []
-    if len(sizes) < 2 or len(people) < 3:
-        return None
-    x = np.log(np.array(sizes, dtype=np.float64))
-    table = np.array([[points[m][p] for m in sizes] for p in people], dtype=np.float64)
-    slopes = (table - table.mean(axis=1, keepdims=True)) @ (x - x.mean()) / ((x - x.mean()) ** 2).sum()
-    step = math.log((sizes[-1] + more) / sizes[-1])
-    gain = summary(slopes * step)
-    means = tuple((m, float(table[:, k].mean())) for k, m in enumerate(sizes))
-    if gain.mean is None or gain.ci95 is None:
-        return None
-    return LearningCurve(means, more, gain.mean, gain.ci95)
 
 
 @dataclass(frozen=True)
@@ -349,7 +298,7 @@ class _Making:
                 self._progress(BudgetProgress(stage, done / whole, row, str(bundle)))
 
             scores = evaluate_run(run, spec, progress=fold_done, warn=self._warn if spec.people is None else silent)
-            return {row.subject: row.metrics["accuracy"] for row in scores.scores.subjects}
+            return accuracies(scores)
 
         started = time.monotonic()
         points = {plan.trained_people: evaluated(EVALUATING, 1.0, FoldsSpec(out))}

@@ -178,7 +178,10 @@ def export(
     if package.model_version:
         given = replace(given, provenance=given.provenance | {"model_version": package.model_version})
     names = {"name": package.name, "url": package.url}
-    return emit(integer_model(given), given, Path(out), **names, also=also, windows=windows)
+    done = emit(integer_model(given), given, Path(out), **names, also=also, windows=windows)
+    if done.no_page:
+        warn(done.no_page)
+    return done
 
 
 @dataclass(frozen=True)

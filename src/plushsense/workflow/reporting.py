@@ -265,7 +265,7 @@ def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _learning(path: Path) -> dict[str, Any] | None:
-    """Read the learning curve beside an evaluation (`plushsense.workflow.budget`); None if there is none."""
+    """Read the learning curve beside an evaluation (`plushsense.workflow.learning`); None if there is none."""
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

@@ -348,7 +348,7 @@ def test_an_edited_model_that_agrees_with_its_golden_vectors_is_not_vouched_for(
     # The header holds the checksum of the image.
     out = capsys.readouterr().out
     assert "NOT OURS: plush_model.h, plush_model.c, plush_model.bin, " in out
-    assert "plush_model.c, export.json are not what this PlushSense writes" in out
+    assert "plush_model.c, web/index.html, export.json are not what this PlushSense writes" in out
     edit(own / "export.json", '"smoothing": ', '"smoothing": true, "was": ')
     assert main(["verify", str(own), "--target", "host"]) == 2
     assert "smoothing is True" in capsys.readouterr().err

@@ -33,6 +33,7 @@ from plushsense.deploy.golden import COLUMNS, HEAD, Vectors, answers_of, golden_
 from plushsense.deploy.package import export_files, foreign_files
 from plushsense.deploy.proof.scenarios import patches_of, scenarios_of
 from plushsense.deploy.quantize import integer_model
+from plushsense.deploy.web import MODULE
 from plushsense.devices.virtual.stream import ToySpec, received
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.fixed import Ints
@@ -119,9 +120,13 @@ class Export:
         files = {file: self._read_file(prefixed(file, name)) for file in self._code}
         check_names(url=facts.url)
         self.facts = replace(facts_of(self.model, self.bundle, self._code[IMAGE]), name=name, url=facts.url)
-        changed, self.edited = foreign_files(self.folder, export_files(self.bundle, self.facts, self._code), name)
-        written = replace(self.facts, conversions=facts.conversions, files=facts.files)
-        same = json.dumps(facts.to_json(), sort_keys=True) == json.dumps(written.to_json(), sort_keys=True)
+        # A module is of one compiler, and proved by running it; the page must hold this one.
+        self.has_module = (self.folder / MODULE).is_file()
+        module = self._read_file(MODULE) if self.has_module else None
+        written = export_files(self.bundle, self.facts, self._code, module)
+        changed, self.edited = foreign_files(self.folder, written, name)
+        said = replace(self.facts, conversions=facts.conversions, files=facts.files)
+        same = json.dumps(facts.to_json(), sort_keys=True) == json.dumps(said.to_json(), sort_keys=True)
         self.changed = (*changed, *([] if same else [FACTS]))
         compiled = {prefixed(file, name) for file in files} & set(self.changed)
         self._files = {f: c if f == IMAGE else without_prefix(c, name) for f, c in files.items()} if name else None

@@ -23,7 +23,17 @@ from plushsense.core.sentences import Message
 from plushsense.deploy.code import IMAGE, LIBRARY, MODEL
 from plushsense.deploy.golden import Counts, Vectors, counted
 from plushsense.deploy.proof.vectors import Export, RowComparison, compare
-from plushsense.deploy.targets import C_FOLDER, TARGETS, CompileSpec, build, missing_tools, require, target_named
+from plushsense.deploy.targets import (
+    C_FOLDER,
+    TARGETS,
+    CompileSpec,
+    Program,
+    build,
+    missing_tools,
+    require,
+    target_named,
+)
+from plushsense.deploy.web import MODULE, WASM, run_module
 
 Progress = Callable[[int, int], None]
 Stream = tuple[Vectors, ...]  # run by one program, one after the other
@@ -185,7 +195,7 @@ def verify(
     """
     if not trust:
         export.require_unchanged()
-    settings, not_run = _choose(targets, only)
+    settings, not_run = _choose(targets, only, export)
     scenarios = (*export.scenarios(), *export.patched())
     streams: list[Stream] = [(export.golden,), *([scenarios] if scenarios else []), *((v,) for v in vectors)]
     runs = []
@@ -204,7 +214,9 @@ def verify(
     return VerificationResult(export.title, changed, decisions, counted(all_vectors), tuple(runs), tuple(not_run))
 
 
-def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[list[Setting], list[tuple[str, str]]]:
+def _choose(
+    targets: Sequence[str], only: Callable[[Setting], bool], export: Export
+) -> tuple[list[Setting], list[tuple[str, str]]]:
     """Return the settings that can run on this computer, and (name, reason) of the others."""
     runnable: list[Setting] = []
     not_run: list[tuple[str, str]] = []
@@ -213,7 +225,7 @@ def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[li
             not_run.append((name, Message("it takes minutes, and only runs when it is named")))
             continue
         settings = [s for s in settings_of(target_named(name).name) if only(s)]
-        lacks = {s: _lacks(s) for s in settings}
+        lacks = {s: _lacks(s, export) for s in settings}
         here = [s for s in settings if not lacks[s]]
         if targets and not here:
             require(name)
@@ -230,8 +242,10 @@ def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[li
     return runnable, not_run
 
 
-def _lacks(setting: Setting) -> str:
+def _lacks(setting: Setting, export: Export) -> str:
     """Return why a setting cannot run on this computer; "" if it can."""
+    if setting.target == WASM and not export.has_module:
+        return Message("the export holds no {file}: export the model again", file=MODULE)
     missing = missing_tools(setting.target, cc=setting.cc)
     if setting.cpp and shutil.which("g++") is None:
         missing.append("g++")
@@ -314,9 +328,24 @@ class _Runner:
         names = " and ".join(dict.fromkeys(v.name for v in stream))
         where = f"On {setting.target} ({setting.compiler} {setting.options}), {names}"
         expected = np.concatenate([v.answers for v in stream])
+        timeout_s = 60 + 0.02 * sum(len(v.frames) for v in stream) + self.export.seconds(stream)
+        try:
+            if setting.target == WASM:
+                got = run_module(self.export.folder, self.code / IMAGE, path, timeout_s=timeout_s)
+            else:
+                got = self._program(setting, cases, out).run(timeout_s=timeout_s, given=path if reads else None)
+        except ProgramError as cause:
+            return RowComparison(len(expected), len(expected), 0, f"{where}: {cause}")
+        result = compare(expected, got, labels)
+        return replace(result, first=f"{where}: {result.first}.") if result.first else result
+
+    def _program(self, setting: Setting, cases: Cases, out: Path) -> Program:
+        """Build the program for one stream."""
+        stream, path = cases
+        reads = bool(TARGETS[setting.target].emulator)
         defines = {
             "PLUSH_HARNESS_CHANNELS": stream[0].frames.shape[1] - 1,
-            "PLUSH_HARNESS_CLASSES": len(labels),
+            "PLUSH_HARNESS_CLASSES": len(self.export.labels),
             "PLUSH_HARNESS_MEMORY_BYTES": self.memory_bytes,
             **({"PLUSH_HARNESS_IMAGE": 1, "PLUSH_HARNESS_BOTH": 1} if setting.image else {}),
             **({"PLUSH_HARNESS_KEPT_BYTES": max(v.kept_bytes for v in stream)} if reads else {}),
@@ -326,7 +355,7 @@ class _Runner:
         harness = out / ("harness.cpp" if setting.cpp else "harness.c")
         lines = [f"#define {name} {value}" for name, value in defines.items()]
         harness.write_text("\n".join([*lines, "#line 1", HARNESS.read_text(encoding="utf-8")]), encoding="utf-8")
-        program = build(
+        return build(
             setting.target,
             [self.code / LIBRARY[1], harness, self.code / MODEL[1]],
             out,
@@ -335,10 +364,3 @@ class _Runner:
             blobs={**({} if reads else {"cases": path}), **({"image": self.code / IMAGE} if setting.image else {})},
             object_folder=self.objects,
         )
-        try:
-            timeout_s = 60 + 0.02 * sum(len(v.frames) for v in stream) + self.export.seconds(stream)
-            got = program.run(timeout_s=timeout_s, given=path if reads else None)
-        except ProgramError as cause:
-            return RowComparison(len(expected), len(expected), 0, f"{where}: {cause}")
-        result = compare(expected, got, labels)
-        return replace(result, first=f"{where}: {result.first}.") if result.first else result

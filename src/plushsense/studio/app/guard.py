@@ -202,7 +202,9 @@ async def _bounded(app: ASGIApp, scope: Scope, receive: Receive, send: Send, hea
             return
         if message["type"] == "http.response.start":
             started = True
-            message = {**message, "headers": [*message.get("headers", []), *_security_headers(nonce)]}
+            own = list(message.get("headers", []))
+            names = {name for name, _ in own}
+            message = {**message, "headers": [*own, *(h for h in _security_headers(nonce) if h[0] not in names)]}
         await send(message)
 
     try:
@@ -263,9 +265,28 @@ def download_address(kind: str, name: str) -> str:
     return f"/download/{kind}/{quote(name, safe='')}.zip"
 
 
+def page_address(name: str) -> str:
+    """Return the address of the page of an export."""
+    return f"/page/{quote(name, safe='')}"
+
+
 def router(workspace: Workspace) -> APIRouter:
-    """Return a router that serves the addresses made by `download_address`."""
+    """Return a router that serves the addresses made by `download_address` and `page_address`."""
     routes = APIRouter()
+
+    @routes.get("/page/{name}", include_in_schema=False)
+    def page(name: str) -> Response:
+        from plushsense.deploy.web import PAGE, page_policy
+
+        # Of an export from elsewhere, too, only the script of this version runs.
+        headers = {"content-security-policy": page_policy(), "cache-control": "no-store"}
+        try:
+            content = (path_in(workspace, EXPORTS, name) / PAGE).read_bytes()
+        except (ConfigError, OSError):
+            content = b""
+        if headers["content-security-policy"].encode() not in content:
+            return PlainTextResponse("This export has no page of this version of PlushSense: export again.\n", 404)
+        return Response(content, media_type="text/html; charset=utf-8", headers=headers)
 
     @routes.get("/download/{kind}/{name}.zip", include_in_schema=False)
     def download(kind: str, name: str) -> Response:

@@ -158,7 +158,7 @@ class ResultRow:
         interval: 95 % interval of the mean accuracy, see `score_interval`.
         people: accuracy of each person of an evaluation.
         rest: accuracy of recordings at rest if they are scored apart, as where whole people are left out.
-        learning: see `plushsense.workflow.budget.learning_curve`.
+        learning: see `plushsense.workflow.learning.learning_curve`.
         apart: further values that are equal in comparable results: hash of the data set, classes, held-back people.
         settings: hash of the data set and all settings of the training; equal for a network and its evaluation.
         proof: folder of the evaluation that gives the score; None if it is that of a training or a trial.

@@ -15,8 +15,9 @@ from plushsense.deploy.code import ModelFacts
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
 from plushsense.deploy.targets import TARGETS
+from plushsense.deploy.web import PAGE
 from plushsense.models.bundle import Bundle
-from plushsense.studio.app.guard import download_address, path_in
+from plushsense.studio.app.guard import download_address, page_address, path_in
 from plushsense.studio.app.jobs import Jobs, StudioJob
 from plushsense.studio.app.shell import (
     Page,
@@ -150,6 +151,13 @@ def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
         text(words("Give this file to the person who programs the toy."))
         download = ui.link(words("Download as a zip"), download_address(EXPORTS, export.name)).classes("ps-link")
         tag(download.props("download"), "download")
+        if PAGE in export.files:
+            text(words("This page reads a toy in Chrome or Edge. It needs neither PlushSense nor a network."))
+            place = page_address(export.name)
+            tag(ui.link(words("Open in the browser"), place, new_tab=True).classes("ps-link"), "open-page")
+            saved = ui.link(words("Save the page"), place).classes("ps-link")
+            saved.props["download"] = f"{export.name}.html"
+            tag(saved, "save-page")
         with _folded(words("Details for the engineer")):
             _list_facts(words, export, model)
 
