@@ -135,6 +135,9 @@ def test_in_whole_numbers_and_beside_the_floats(bundle: Path, recordings: Path) 
     assert len(known) > 200
     both, summary = live(*words, "--engine", "both")
     assert both == whole
+    easily, more = live(*words, "--engine", "int8", "--sensitivity", "127")
+    assert [d["confidence"] for d in easily] == [d["confidence"] for d in whole]
+    assert more["events"] > summary["events"]
     assert summary["agreement"]["gesture"] > 0.8
     floats, _ = live(*words, "--engine", "float")
     assert [(d["t_s"], d["state"]) for d in floats] == [(d["t_s"], d["state"]) for d in whole]

@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 
 from plushsense.core.layouts import MOST_CALIBRATED_OTHER, Channel
 from plushsense.deploy.code import CALIBRATE, LIBRARY, library_files
-from plushsense.deploy.golden import HEAD, answers_of
+from plushsense.deploy.golden import HEAD, HEALTH, ToyRows, answers_of
 from plushsense.deploy.package import ARDUINO, IDF
+from plushsense.deploy.proof.scenarios import exchanges_of
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import CALIBRATED_IMAGE_VERSION, IntegerModel, image_head, memory_bytes
+from plushsense.windows.clock import LONG_PAUSE_MS
 from support.c_toy import Seat, seat
 from support.exports import bundle_of, exported
 from support.integers import any_frames, models, vector_model
@@ -55,6 +57,23 @@ def test_what_was_found_out_survives_a_gap_but_no_other_model(calibrated_library
     assert not np.array_equal(whole[-len(after) :, HEAD:], after[:, HEAD:]), "the first model had calibrated itself"
 
 
+def test_a_call_between_the_frames_is_the_reboot_that_the_host_sees() -> None:
+    bundle = bundle_of("accel-3", "3d1_2d2", "3,4", window=40)
+    model = integer_model(replace(bundle, layout=replace(bundle.layout, self_calibration=bundle.layout.names)))
+    vectors = exchanges_of(model, bundle.scaler)
+    reboot, exchange = (call.frame for call in vectors.calls)
+    frames = vectors.frames[: exchange + 1]
+    toy, host = ToyRows(model), np.where(np.arange(len(frames)) > reboot, LONG_PAUSE_MS, 0)
+    for at, (ms, *values) in enumerate(frames.tolist()):
+        toy.frame = at
+        for moment in toy.toy.push(ms, values, int(host[at])):
+            toy.add(moment)
+    expected = vectors.answers[vectors.answers[:, 1] <= exchange]
+    assert np.array_equal(toy.take(), expected[expected[:, 0] != HEALTH])
+    called = answers_of(model, frames, vectors.calls)
+    assert not np.array_equal(called[-20:], answers_of(model, frames)[-20:]), "the sensors before are not forgotten"
+
+
 def test_each_library_takes_its_own_models(c_library: Any, calibrated_library: Any) -> None:
     model = calibrated_model()
     assert seat(calibrated_library, model).status == OK
@@ -74,6 +93,7 @@ def test_only_an_export_of_such_a_model_has_the_file(c_compiler: str, tmp_path: 
         assert {p.relative_to(out).as_posix() for p in out.rglob(CALIBRATE)} == {f"{w}{CALIBRATE}" for w in where}
     done = verify(Export(out), ["host"], only=lambda s: s.optimise == "-O2" and s.compiler == "gcc")
     assert done.passed and done.own and len(done.runs) == 3, "compiled in, from a file, and called from C++"
+    assert "exchange" in {counts.name for counts in done.counts}
 
 
 def test_ten_touch_channels_and_an_accelerometer(calibrated_library: Any) -> None:

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -145,6 +146,56 @@ def test_another_scale_is_noticed_at_rest_only(tmp_path: Path, c_compiler: str) 
             rows = np.rint(np.outer(length * gravity, [0.6, 0.0, 0.8])).astype(np.int64) + np.array([0, 100, 0])
             found = [n for n, row in enumerate(rows.tolist()) if check(state, 5 + 10 * n, (ctypes.c_int32 * 3)(*row))]
             assert found == ([] if seconds is None else [100 * seconds]), (gravity, length[:5])
+
+
+NO_GESTURE = r"""
+#include <stdio.h>
+#include "plush_reaction.h"
+#include "plush_model.h"
+
+int main(void)
+{
+    static uint32_t memory[PLUSH_MODEL_MEMORY_WORDS];
+    static plush_toy toy;
+    static plush_reaction reaction;
+    const char *label;
+    plush_look look;
+    int affect;
+
+    if (plush_begin(&toy, plush_model, PLUSH_MODEL_BYTES, memory, sizeof memory) != PLUSH_OK)
+        return 1;
+    toy.event.what = PLUSH_BEGUN;
+    toy.event.gesture = PLUSH_NO_GESTURE;
+    for (affect = 0; affect < 4; affect++) {
+        toy.event.affect = (plush_affect)affect;
+        toy.answers++;
+        plush_react(&reaction, &toy, 10000u * (uint32_t)(affect + 1), &look);
+        printf("%d,%d,%d,%d ", look.red, look.green, look.blue, look.tone_hz);
+    }
+    label = plush_gesture_name(&toy, toy.event.gesture);
+    printf("%d %d\n", *label, plush_probability(&toy, toy.event.gesture));
+    toy.event.affect = PLUSH_AFFECT_NONE; /* a colour of its own for a gesture; and then no model runs any more */
+    toy.event.gesture = 0;
+    toy.answers++;
+    plush_react(&reaction, &toy, 50000, &look);
+    if (plush_begin(&toy, plush_model, 0, memory, sizeof memory) == PLUSH_OK)
+        return 1;
+    plush_react(&reaction, &toy, 50010, &look);
+    return 0;
+}
+"""
+
+
+def test_an_event_without_a_gesture_is_safe_to_show_and_to_name(
+    packages: Packages, c_compiler: str, tmp_path: Path
+) -> None:
+    out = packages["accel-3"][0]
+    (tmp_path / "show.c").write_text(NO_GESTURE)
+    sources = [out / "plushsense.c", out / "plush_model.c", out / SKETCH / "plush_reaction.c", tmp_path / "show.c"]
+    checks = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    run(c_compiler, "-std=c99", *checks, *WARNINGS, f"-I{out}", f"-I{out / SKETCH}", *sources, "-o", tmp_path / "show")
+    shown = subprocess.run([tmp_path / "show"], check=True, capture_output=True, text=True).stdout
+    assert shown == "40,40,40,0 0,255,0,392 40,40,40,0 255,0,0,1400 0 0\n"
 
 
 def test_a_bundle_of_before_exports_and_says_that_the_scale_is_not_known(packages: Packages) -> None:

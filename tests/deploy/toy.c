@@ -178,6 +178,11 @@ void seat_restart(void *p)
     plush_restart(&((seat *)p)->toy);
 }
 
+void seat_sensitivity(void *p, int sensitivity)
+{
+    ((seat *)p)->toy.sensitivity = (int8_t)sensitivity;
+}
+
 /* Every count as it is after nearly 2^32 of what it counts. */
 void seat_age(void *p, uint32_t by)
 {

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
+from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.deploy.golden import ANSWER, EVENT
-from plushsense.deploy.quantize import calibrated, integer_model
+from plushsense.deploy.quantize import calibrated, classifier_of, integer_model
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
 from plushsense.live.loop import run_live
@@ -41,10 +42,11 @@ def library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
     return compiled(c_compiler, tmp_path_factory)
 
 
-def of_the_c(library: Any, model: IntegerModel, frames: list[Frame]) -> np.ndarray:
+def of_the_c(library: Any, model: IntegerModel, frames: list[Frame], sensitivity: int) -> np.ndarray:
     """The C's answers and events; in the end nothing more is heard."""
     toy = Seat(library, model.to_bytes(), len(model.layout.channels), model.network.arch.classes)
     assert toy.status == 0
+    library.seat_sensitivity(toy.toy, sensitivity)
     numbers = np.array([[f.device_ms, *f.values] for f in frames], dtype=np.int64)
     rows = toy.push(numbers, [len(frames) - 1]).astype(np.int64)
     rows[:, 2] %= 2**32  # the toy's clock is a uint32_t, and a garbled line may hold any time
@@ -54,9 +56,10 @@ def of_the_c(library: Any, model: IntegerModel, frames: list[Frame]) -> np.ndarr
     return np.concatenate([answers, events])
 
 
-def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
+def of_live(model: IntegerModel, frames: list[Frame], sensitivity: int = 0) -> np.ndarray:
     """The live engine's decisions and events in the C's terms, with every decimal that they have."""
     classifier = IntegerClassifier(model)
+    classifier.sensitivity = sensitivity
     answers, events = [], []
     labels, period = model.gestures.labels, model.layout.period_us
     zero = frames[0].device_ms * 1000.0
@@ -97,10 +100,10 @@ def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
     return np.array([*answers, *events]).reshape(-1, 10)
 
 
-def equal(library: Any, model: IntegerModel, frames: list[Frame]) -> np.ndarray:
+def equal(library: Any, model: IntegerModel, frames: list[Frame], sensitivity: int = 0) -> np.ndarray:
     """Assert that both say the same, answers and events; the live engine's answers: row, ms, whether it tracks,
     gesture, affect, confidence, restarts, invalid."""
-    found, wanted = of_live(model, frames), of_the_c(library, model, frames)
+    found, wanted = of_live(model, frames, sensitivity), of_the_c(library, model, frames, sensitivity)
     np.testing.assert_array_equal(found, wanted)
     return found[found[:, 0] == ANSWER][:, [1, 2, 3, 4, 5, 6, 8, 9]]
 
@@ -181,6 +184,23 @@ def test_what_a_toy_that_knows_its_touches_tells(library: Any) -> None:
     events = events[events[:, 0] == EVENT]
     assert {(what, source) for what, source in events[:, [4, 7]].tolist()} >= {(1, 0), (1, 1), (2, 1), (3, 0), (3, 1)}
     assert set(events[:, 6]) == {1, 3}
+
+
+def test_sensitivity_is_that_of_the_c_for_every_engine(library: Any) -> None:
+    bundle, values = knowing_bundle(), toy_frames("rest stroke hit rest")
+    spec = DecideSpec(smoothing_s=0.3, enter=0.995, leave=0.99, enter_affect=0.999, leave_affect=0.99, sure=0.3)
+    frames = [Frame(0, 10 * i, tuple(row)) for i, row in enumerate(values.tolist())]
+    for sensitivity, begun in ((-40, set()), (0, {"hit"}), (40, {"stroke", "hit"})):
+        equal(library, integer_model(bundle, spec), frames, sensitivity)
+        for engine in ("float", "both"):
+            reader = classifier_of(bundle, spec, engine)
+            reader.sensitivity = sensitivity
+            reader.reset()
+            events = [e for frame in frames for d in reader.push(frame) for e in d.events]
+            assert {e.gesture for e in events} == begun
+            assert not isinstance(reader, BothEngines) or reader.original.in_event == reader.in_event
+    with pytest.raises(ConfigError, match="accepted are -128 to 127"):
+        reader.sensitivity = 128
 
 
 def test_both_engines_are_counted_against_each_other() -> None:

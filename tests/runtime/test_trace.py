@@ -121,6 +121,21 @@ def test_a_real_stream(engine: str, real_data: Path) -> None:
         assert any(e[0] == "begun" for e in events_of(decisions))
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_self_calibration_over_a_glitch_and_a_reboot_with_another_sensor(engine: str) -> None:
+    bundle, at = replace(BUNDLE, layout=replace(BUNDLE.layout, self_calibration=("x", "y", "z"))), 1500
+    spec = replace(SPEC, health=HealthSettings(fault_ms=150, recover_ms=100))
+    frames = stream(3, 3000, [("back", 0.2, 40), ("garbage", 0.3, 60), ("stray", 0.4, 80), ("garbage", 0.49, 60)])
+    frames.values[:at] = frames.values[:at] * 3 + 4000
+    frames.device_ms[at:] -= frames.device_ms[at]
+    frames = replace(frames, host_ms=np.arange(len(frames)) * 10 + np.where(np.arange(len(frames)) < at, 0, 10**8))
+    decisions = same(bundle, spec, engine, frames)
+    assert sum(d.state == "no signal" for d in decisions) >= 3 and any(d.state == "sensor fault" for d in decisions)
+    fresh = lived(reader_of(bundle, spec, engine), frames.slice(at + 1, len(frames)))
+    shares = [d.probabilities for d in fresh if d.probabilities is not None]
+    assert [d.probabilities for d in decisions if d.probabilities is not None][-len(shares) :] == shares
+
+
 def test_silence_in_the_middle_ends_the_event_and_the_stream_goes_on() -> None:
     frames = stream(5, 900, [])
     reader = reader_of(BUNDLE, argmax_spec(), "float")

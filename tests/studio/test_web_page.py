@@ -6,6 +6,7 @@ Each thing is compared with the Python that defines it, on the same bytes.
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,17 +15,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plushsense.core.gestures import gesture_set_names, load_gestures
-from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.gestures import AFFECTS, gesture_set_names, load_gestures
+from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import read_recording, read_stream
 from plushsense.deploy.code import IMAGE, facts_of
 from plushsense.deploy.quantize import integer_model
-from plushsense.deploy.wasm import module
+from plushsense.deploy.wasm import WEB, module
 from plushsense.deploy.web import PAGE, web_files
 from plushsense.devices.base import Counters, Frame
+from plushsense.devices.ble import UART_SERVICE, UART_TX
 from plushsense.devices.opening import open_device
 from plushsense.devices.wire import LineParser
-from plushsense.live.reactions import Reactor, load_reactions
+from plushsense.live.reactions import EYES, Reactor, load_reactions
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import IntegerClassifier
 from plushsense.runtime.image import IntegerModel
@@ -43,12 +45,12 @@ _PORT = """() => {
   window.sendBytes = (text) => sink.enqueue(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)));
   window.breakPort = () => { port.readable = null; sink.error(new Error('The device has been lost.')) };
   Object.defineProperty(navigator, 'serial', { value: { requestPort: async () => port } });
-  Object.defineProperty(navigator, 'bluetooth', { value: undefined });
   window.answers = [];
   addEventListener('plushsense', ({ detail: { toy } }) => {
     toy.onAnswer = (a) => answers.push([a.ms, a.state, a.kind, a.affect, a.gesture, a.confidence]);
   });
 }"""
+_NO_RADIO = "() => Object.defineProperty(navigator, 'bluetooth', { value: undefined })"
 _PLUSH = load_layout("plush-15")
 GAP = 40_000
 
@@ -94,7 +96,7 @@ def pages(look: Callable[..., Look], tmp_path: Path) -> Iterator[Callable[..., O
     """``pages(layout)`` opens the page of a small model from a file, without a network; it may not ask for anything."""
     seen: list[tuple[Look, Path]] = []
 
-    def new(bundle: Bundle | str = "plush-15", **how: Any) -> Opened:
+    def new(bundle: Bundle | str = "plush-15", radio: str = _NO_RADIO, **how: Any) -> Opened:
         bundle = bundle if isinstance(bundle, Bundle) else bundle_of(bundle)
         model = integer_model(bundle)
         image = model.to_bytes()
@@ -107,7 +109,7 @@ def pages(look: Callable[..., Look], tmp_path: Path) -> Iterator[Callable[..., O
         page.set_viewport_size({"width": looking.size[0], "height": looking.size[1]})
         for event, note in (("console", looking._log), ("pageerror", looking._fail)):
             page.on(event, note)
-        page.add_init_script(f"({_PORT})()")
+        page.add_init_script(f"({_PORT})(); ({radio})()")
         page.goto(file.as_uri())
         seen.append((looking, file))
         return Opened(page, model, looking)
@@ -298,6 +300,10 @@ def test_what_happens_is_named_spoken_and_saved_in_both_languages(
     opened.until("state", "Savienojas")
     page.click("summary")
     page.select_option("#gesture", "Tail hit 2")
+    page.check("#simulated")
+    page.click("#record")
+    opened.until("message", "Simulētus datus šeit neieraksta")
+    page.uncheck("#simulated")
     page.click("#record")
     frames = _stream(_PLUSH, 15)
     opened.send(b"\n" + _bytes(_PLUSH, frames))
@@ -331,6 +337,54 @@ def test_what_happens_is_named_spoken_and_saved_in_both_languages(
     page.evaluate("() => breakPort()")
     opened.until("message", "The toy went away (The device has been lost.)")
     assert axe(page) == []
+
+
+# What navigator.bluetooth is to the page: a toy that notifies what the test sends.
+_RADIO = """() => {
+  const tx = new EventTarget(), device = new EventTarget(), asked = [];
+  tx.startNotifications = async () => {};
+  const characteristic = { getCharacteristic: async (uuid) => (asked.push(uuid), tx) };
+  const server = { getPrimaryService: async (uuid) => (asked.push(uuid), characteristic) };
+  device.gatt = { connect: async () => server, disconnect: () => {} };
+  window.notify = (text) => {
+    tx.value = new DataView(Uint8Array.from('..' + text, (c) => c.charCodeAt(0)).buffer, 2);
+    tx.dispatchEvent(new Event('characteristicvaluechanged'));
+  };
+  window.switchOff = () => device.dispatchEvent(new Event('gattserverdisconnected'));
+  window.asked = asked;
+  const requestDevice = async (how) => (asked.push(how.filters[0].services[0], how.optionalServices[0]), device);
+  Object.defineProperty(navigator, 'bluetooth', { value: { requestDevice } });
+}"""
+
+
+def test_a_bluetooth_toy_with_older_firmware_is_read_until_it_goes_away(pages: Callable[..., Opened]) -> None:
+    old = load_layout("plush-14")
+    opened = pages(radio=_RADIO)
+    opened.page.click("#bluetooth")
+    opened.until("message", "Reading the toy.")
+    assert opened.page.evaluate("() => asked") == [UART_SERVICE, UART_SERVICE, UART_SERVICE, UART_TX]
+    lines = _bytes(old, _stream(old, 1)).decode()
+    for at in range(0, len(lines), 20):
+        opened.page.evaluate("(text) => notify(text)", lines[at : at + 20])
+    n = lines.count("\n") - 10  # that many show what they are
+    opened.page.wait_for_function("(n) => plushPage.run.frames === n", arg=n)
+    assert opened.page.evaluate("() => plushPage.run.parser.clock") == 10 * (n - 1)
+    opened.page.evaluate("() => switchOff()")
+    opened.until("message", "The toy went away (disconnected).")
+
+
+def test_each_sentence_of_the_page_has_a_translation_and_is_used() -> None:
+    script, template = ((WEB / name).read_text("utf-8") for name in ("page.js", "page.html.j2"))
+    table, rest = script.split("const LATVIAN = {")[1].split("\n};", 1)
+    translated = set(re.findall(r'"([^"]+)": "[^"]+"|(\w+): "', table))
+    translated = {quoted or bare for quoted, bare in translated}
+    used = set(re.findall(r"data-t[^>]*>([^<]*)</", template)) | set(re.findall(r"\bt\(\"([^\"]+)\"", rest))
+    used |= {text for text in re.findall(r'"([^"\n]+)"', rest) if re.match(r"[A-Z“].* .*", text)}
+    labels = {label for name in gesture_set_names() for label in load_gestures(name).labels}
+    names = {re.sub(r" \d$", "", label) for label in labels} | {"At rest", *AFFECTS, "purr", "shriek"}
+    names |= {name for layout in layout_names() for name in load_layout(layout).names} | {f"Eyes {e}" for e in EYES}
+    assert used - labels - translated == set()
+    assert [text for text in translated - names if text not in rest + template] == []
 
 
 def test_names_are_those_of_the_studio(pages: Callable[..., Opened]) -> None:

@@ -24,7 +24,7 @@ def outcomes_of(scenario: Vectors) -> set[str]:
     at = {name: n for n, name in enumerate(COLUMNS[EVENT])}
     state, warm, ended = COLUMNS[ANSWER].index("state"), False, None
     frame = COLUMNS[ANSWER].index("frame")
-    silent = {call.frame for call in scenario.calls if call.action != "sensitivity"}
+    silent = {call.frame for call in scenario.calls if call.action in ("silence", "prime")}
     for n, row in enumerate(rows.tolist()):
         after = rows[n + 1].tolist() if n + 1 < len(rows) else None
         if row[0] == ANSWER:

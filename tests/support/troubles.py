@@ -134,8 +134,9 @@ def reader_of(bundle: Bundle, spec: DecideSpec, engine: str) -> StreamReader:
 
 def lived(reader: StreamReader, frames: Frames) -> list[Decision]:
     """Every decision of the live loop, and in the end that nothing more is heard."""
-    rows = zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True)
-    return [d for ms, row in rows for d in reader.push(Frame(0, ms, tuple(row)))] + [reader.silence()]
+    host = np.zeros(len(frames), dtype=np.int64) if frames.host_ms is None else frames.host_ms
+    rows = zip(host.tolist(), frames.device_ms.tolist(), frames.values.tolist(), strict=True)
+    return [d for now, ms, row in rows for d in reader.push(Frame(now, ms, tuple(row)))] + [reader.silence()]
 
 
 def events_of(decisions: list[Decision]) -> list[tuple[Any, ...]]:

@@ -88,8 +88,8 @@ def test_streams_and_segments_have_the_same_inputs_also_after_a_gap() -> None:
     assert first == [[0] * 6], "a new stream begins anew"
 
 
-def written(folder: Path, layout: Layout, gain: float = 1.0, offset: int = 0) -> Dataset:
-    """Ana has a stream with two recordings, Ben three recordings alone."""
+def written(folder: Path, layout: Layout, gain: float = 1.0, offset: int = 0, pause_ms: int = 0) -> Dataset:
+    """Ana has a stream with two recordings, Ben three recordings alone, before the last of which the toy may be off."""
     ana, ben = folder / "src" / "ana", folder / "src" / "ben"
     for place in (ana, ben):
         place.mkdir(parents=True)
@@ -102,7 +102,9 @@ def written(folder: Path, layout: Layout, gain: float = 1.0, offset: int = 0) ->
     alone = np.rint(readings(1200, 6) * gain + offset).astype(np.int64)
     for label, at in (("Wave", 0), ("Shake", 1), ("Wave", 2)):
         part = frames(alone[400 * at : 400 * at + 400], 100_000 * at)
-        write_recording(ben / recording_filename(label, 1_100_000 + 100_000 * at, 400), part, PLAIN)
+        if at == 2 and pause_ms:
+            part = replace(part, device_ms=part.device_ms - 200_000, host_ms=part.host_ms + pause_ms)
+        write_recording(ben / recording_filename(label, int(part.host_ms[-1]), 400), part, PLAIN)
     return import_recordings(folder / "src", folder / "DS", layout=layout).dataset
 
 
@@ -132,6 +134,74 @@ def test_the_past_of_the_session_is_used_and_nothing_else(tmp_path: Path) -> Non
     assert cut_windows(dataset.with_inputs(replace(LAYOUT, self_calibration=()))).self_calibration == ""
     other = cut_windows(written(tmp_path / "b", LAYOUT, 4.0, -20_000))
     assert np.abs(windows.integers - other.integers).max() <= 0.02 * UNIT
+
+
+DAY_MS = 24 * 3_600_000
+
+
+def over_a_boundary(device_step_ms: int, host_step_ms: int, stale: int) -> tuple[Frames, int]:
+    """Frames of a sensor with another gain and offset, and of the usual one after a boundary, at the row returned.
+
+    The last ``stale`` frames of the other one come after the pause.
+    """
+    other, own = frames(np.rint(readings(3000, 8) * 0.2 + 9000).astype(np.int64)), frames(readings(1500, 9))
+    device = own.device_ms + other.device_ms[-1] + device_step_ms
+    assert other.host_ms is not None
+    values, clock = np.concatenate([other.values, own.values]), np.concatenate([other.device_ms, device])
+    host = np.concatenate([other.host_ms, own.device_ms + other.host_ms[-1] + host_step_ms])
+    host[len(other) - stale : len(other)] += host_step_ms
+    return Frames(values, clock, host), len(other)
+
+
+def gravity_error(inputs: NDArray[np.int64], wanted: NDArray[np.int64]) -> float:
+    """The median angle, in degrees, between the directions of gravity among the inputs (T, 6) of two readers."""
+    one, other = (np.median(rows[-1000:].reshape(-1, 100, 6)[:, :, 3:], axis=1) for rows in (inputs, wanted))
+    cosine = (one * other).sum(axis=1) / np.linalg.norm(one, axis=1) / np.linalg.norm(other, axis=1)
+    return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+
+
+@pytest.mark.parametrize(
+    ("boundary", "device_step_ms", "host_step_ms", "stale", "anew"),
+    [
+        ("a reboot and a pause of 17 hours", -25_000, 17 * 3_600_000, 0, True),
+        ("frames that the driver had kept from before the pause", -25_000, 17 * 3_600_000, 70, True),
+        ("a clock that had gone on from a reboot that nobody read", 60_000, DAY_MS, 0, True),
+        ("a pause on both clocks", DAY_MS, DAY_MS, 0, False),
+        ("a reset of the clock alone", -25_000, 300, 0, False),
+        ("a reset with a short pause", -25_000, 120_000, 0, False),
+    ],
+)
+def test_a_reboot_with_a_long_pause_begins_anew(
+    boundary: str, device_step_ms: int, host_step_ms: int, stale: int, anew: bool, tmp_path: Path
+) -> None:
+    layout = replace(LAYOUT, inputs=("x", "y", "z")).for_vectors()
+    whole, at = over_a_boundary(device_step_ms, host_step_ms, stale)
+    folder = tmp_path / "src" / "ana"
+    folder.mkdir(parents=True)
+    (folder / "fulldatastream.csv").write_text(format_rows(whole, PLAIN))
+    part = whole.slice(at + 1000, at + 1400)
+    write_recording(folder / recording_filename("Wave", int(part.host_ms[-1]), 400), part, PLAIN)
+    dataset = import_recordings(tmp_path / "src", tmp_path / "DS", layout=layout).dataset
+    offline = [network_inputs(s.data, layout) for s in SessionReader(dataset).stream("ana/fulldatastream")]
+    # The first frame after the boundary is left out.
+    fresh = network_inputs(SelfCalibration(layout).apply(whole.values[at + 1 :]), layout)
+    assert np.array_equal(offline[-1], fresh) == anew
+    assert (gravity_error(offline[-1], fresh) < 1.0) == anew, boundary
+    reader, live = FrameReader(layout, HealthSettings(fault_ms=0)), list[list[int]]()
+    for ms, row, host_ms in zip(whole.device_ms.tolist(), whole.values.tolist(), whole.host_ms.tolist(), strict=True):
+        live += [item.inputs for item in reader.push(ms, row, host_ms) if isinstance(item, Sample)]
+    assert live == np.concatenate(offline).tolist(), "live is the stream"
+    (recording,) = dataset.used
+    own = network_inputs(SessionReader(dataset).recording(recording)[0].data, layout)[:, :3]
+    assert np.array_equal(own, offline[-1][999:1399, :3]), "and so is a recording in it"
+
+
+@pytest.mark.parametrize(("pause_ms", "anew"), [(DAY_MS, True), (60_000, False)])
+def test_recordings_alone_begin_anew_after_a_reboot(tmp_path: Path, pause_ms: int, anew: bool) -> None:
+    dataset = written(tmp_path, LAYOUT, pause_ms=pause_ms)
+    *_, last = sorted((r for r in dataset.used if r.subject == "ben"), key=lambda r: r.epoch_ms)
+    fresh = SelfCalibration(LAYOUT).apply(resample(dataset.read(last), LAYOUT)[0].data)
+    assert np.array_equal(SessionReader(dataset).recording(last)[0].data, fresh) == anew
 
 
 @pytest.mark.parametrize(

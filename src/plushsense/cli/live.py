@@ -39,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
     if args.smoothing is not None:
         decide = replace(decide, smoothing_s=args.smoothing)
     classifier = classifier_of(bundle, decide, args.engine)
+    classifier.sensitivity = args.sensitivity
     with interrupt_on_signals(), open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
         say(
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "

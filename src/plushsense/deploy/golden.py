@@ -324,7 +324,7 @@ class Call(NamedTuple):
     """A call of the toy after the frame with the index ``frame``; ``value`` is the sensitivity that is set."""
 
     frame: int
-    action: Literal["silence", "prime", "sensitivity"]
+    action: Literal["silence", "prime", "sensitivity", "recalibrate"]
     value: int = 0
 
 
@@ -338,8 +338,8 @@ def answers_of(model: IntegerModel, frames: Ints, calls: Sequence[Call] = ()) ->
     before the answer of the same step, changes of health after all other rows of the frame.
 
     Args:
-        calls: what is called between the frames: ``plush_silence``, ``plush_prime`` with the frame before, or a change
-            of the sensitivity.
+        calls: what is called between the frames: ``plush_silence``, ``plush_prime`` with the frame before,
+            ``plush_recalibrate``, or a change of the sensitivity.
     """
     return ToyRows(model).read(frames, calls)
 
@@ -396,6 +396,8 @@ class ToyRows:
             call = after.get(self.frame)
             if call is not None and call.action == "sensitivity":
                 self.toy.samples.sensitivity = call.value
+            elif call is not None and call.action == "recalibrate":
+                self.toy.frames.recalibrate()
             elif call is not None:
                 moments = self.toy.prime(ms, values) if call.action == "prime" else [self.toy.silence()]
                 for moment in moments:
@@ -533,7 +535,7 @@ class Vectors:
         frames = (self.frames & 0xFFFFFFFF).astype("<u4")
         between = [(at, struct.pack("<I", _PATCH) + _counted(patch)) for at, patch in self.patches]
         for at, called, value in self.calls:
-            more = {"silence": [], "prime": frames[at].tolist(), "sensitivity": [value & 0xFFFFFFFF]}[called]
+            more = {"prime": frames[at].tolist(), "sensitivity": [value & 0xFFFFFFFF]}.get(called, [])
             between.append((at, struct.pack(f"<{1 + len(more)}I", _ACTIONS[called], *more)))
         begin = 0
         for at, action in (*sorted(between), (len(frames) - 1, struct.pack("<I", _END))):
@@ -544,7 +546,7 @@ class Vectors:
 
 # What comes after frames.
 _END, _PATCH = 0, 2
-_ACTIONS = {"silence": 1, "prime": 3, "sensitivity": 4}
+_ACTIONS = {"silence": 1, "prime": 3, "sensitivity": 4, "recalibrate": 5}
 
 
 def _counted(data: bytes) -> bytes:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, LayoutError, ToolError
 from plushsense.core.files import new_folder, read_bytes
 from plushsense.core.layouts import ACCELERATION, DELAY_MS, DEVICE_MS, Channel, Layout
+from plushsense.core.sentences import Message
 from plushsense.core.templates import c_comment, fill_text
 from plushsense.dataset.readings import GravityReading, Readings
 from plushsense.deploy.code import (
@@ -445,11 +446,11 @@ def emit(
     """
     check_names(name, url=url)
     bundle = bundle.without_people()
-    code, web, no_page = code_files(model, bundle), None, ""
+    code, web, no_page = code_files(model, bundle), None, Message()
     try:
         web = module(calibrate=bool(model.layout.self_calibration))
     except ToolError as cause:
-        no_page = str(cause)
+        no_page = cause.message
     with new_folder(out, BadInput) as part:
         conversions = {}
         for other in dict.fromkeys(also):

@@ -156,6 +156,20 @@ class StreamReader:
         """Device time of the newest frame that was not left out, in seconds since the first frame of the stream."""
         return self._machine.frames.time_us / 1e6
 
+    @property
+    def sensitivity(self) -> int:
+        """How readily the network begins and keeps events, see `EventMachine`; 0 as trained. A reset keeps it."""
+        return self._machine.samples.sensitivity
+
+    @sensitivity.setter
+    def sensitivity(self, value: int) -> None:
+        if not -128 <= value <= 127:
+            raise ConfigError("The sensitivity is {value}: accepted are -128 to 127, 0 as trained.", value=value)
+        self._set_sensitivity(value)
+
+    def _set_sensitivity(self, value: int) -> None:
+        self._machine.samples.sensitivity = value
+
     def reset(self) -> None:
         """Begin a new stream at time 0 and set all counts to 0."""
         self._machine.reset()
@@ -179,7 +193,7 @@ class StreamReader:
         frame = whole_frame(frame, self.layout)
         decisions = [
             self._decision(moment)
-            for moment in self._machine.push(frame.device_ms, frame.values)
+            for moment in self._machine.push(frame.device_ms, frame.values, frame.host_ms)
             if not (self._silent and moment.cause == "no signal")  # `silence` has reported it already
         ]
         if self._machine.frames.clock.left_out:
@@ -282,6 +296,10 @@ class BothEngines(IntegerClassifier):
         self.original = original
         self._has_affects = any(g.affect != "none" for g in model.gestures.gestures)
         self._clear_counts()
+
+    def _set_sensitivity(self, value: int) -> None:
+        super()._set_sensitivity(value)
+        self.original.sensitivity = value
 
     def silence(self) -> Decision:
         """End the open event like `StreamReader.silence`; return the deployed model's decision."""

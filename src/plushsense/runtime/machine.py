@@ -2,8 +2,8 @@
 
 1. `FrameReader` resamples frames to evenly spaced samples: it leaves out a single frame out of order, detects gaps and
    resets of the device clock, which break the stream, checks sensor health, applies the clock rule and the
-   self-calibration, and computes the inputs of the network. Only the self-calibration survives a break: the sensor is
-   still the same.
+   self-calibration, and computes the inputs of the network. Of the samples before a break, only the self-calibration
+   knows: the sensor is still the same. After a reboot (rule 4 of the clock) it begins anew, too.
 2. `SampleReader` passes each sample to the gate, and every ``step`` samples computes the network, the decision and the
    events. The steps are aligned so that the first answer is at the sample that completes the span. A break ends the
    open event and restarts everything.
@@ -130,17 +130,24 @@ class FrameReader:
             for _ in range(n - 1):
                 yield Sample(self.time_us, self._inputs(self._calibration.push(list(values))), self.health.suspect)
 
-    def push(self, device_ms: int, values: Sequence[int]) -> Iterator[Sample | Break]:
+    def recalibrate(self) -> None:
+        """Forget all samples of self-calibrating sensors, as after a reboot, like ``plush_recalibrate``."""
+        self._calibration.reset()
+
+    def push(self, device_ms: int, values: Sequence[int], host_ms: int | None = None) -> Iterator[Sample | Break]:
         """Process one frame; yield samples and breaks. When one is yielded, counts and ``zero_us`` are valid for it.
 
-        A frame that rule 1 of `plushsense.windows.clock` leaves out has no effect, as if it had been lost.
+        A frame that rule 1 of `plushsense.windows.clock` leaves out has no effect, as if it had been lost. Without
+        ``host_ms``, no reboot is seen.
         """
         clock, health = self.clock, self.health
         device_us = int(device_ms) * 1000
         if not self._begun:
             self._begun, self.zero_us = True, device_us
-        if not clock.accept(device_ms):
+        if not clock.accept(device_ms, host_ms):
             return
+        if clock.rebooted:
+            self.recalibrate()
         if clock.restarted:
             if not health.fault:
                 yield Break(self.time_us, "no signal")
@@ -306,9 +313,9 @@ class ToyMachine:
         self.frames.reset()
         self.samples.reset()
 
-    def push(self, device_ms: int, values: Sequence[int]) -> Iterator[Moment]:
+    def push(self, device_ms: int, values: Sequence[int], host_ms: int | None = None) -> Iterator[Moment]:
         """Process one frame; yield its moments. When one is yielded, the counts of the readers are valid for it."""
-        return self.samples.read(self.frames.push(device_ms, values))
+        return self.samples.read(self.frames.push(device_ms, values, host_ms))
 
     def continue_from(self, other: ToyMachine) -> Moment:
         """Replace another machine on the same stream, like ``plush_swap``: take over its counts, but no other state.

@@ -32,8 +32,9 @@ from plushsense.runtime.fixed import (
 from plushsense.runtime.health import Health, HealthSettings
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.machine import Break, FloatLogits, InputRows, LogitStream, Sample, SampleReader
-from plushsense.windows.clock import resample, row_times_us
+from plushsense.windows.clock import reboots, resample, row_times_us
 from plushsense.windows.features import network_inputs
+from plushsense.windows.self_calibration import SelfCalibration
 
 Bools = NDArray[np.bool_]
 
@@ -100,11 +101,14 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthSetting
     step_ms = np.diff(frames.device_ms, prepend=frames.device_ms[:1])
     begins = (step_ms < 0) | (step_ms > layout.gap_ms)
     begins[1:] |= fault[1:] != fault[:-1]
+    rebooted, calibration = reboots(frames.device_ms, frames.host_ms, layout.gap_ms), SelfCalibration(layout)
     edges = [0, *np.flatnonzero(begins).tolist(), len(times)]
     parts: list[Part] = []
     for first, last in pairwise(edges):
+        if rebooted[first : first + 1].any():
+            calibration.reset()
         for segment in [] if fault[first:last].any() else resample(frames.slice(first, last), layout):
-            inputs = network_inputs(segment.data, layout)
+            inputs = network_inputs(calibration.apply(segment.data), layout)
             network.reset()
             # A fault ends a part when it is found, a gap at the frame before.
             ends_us = int(times[last] if last < len(times) and fault[last] else times[last - 1])

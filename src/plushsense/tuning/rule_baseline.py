@@ -183,7 +183,7 @@ class RuleBaselineReader:
     def push(self, frame: Frame) -> list[GestureEvent]:
         """Process one frame; return changes of events, with times in seconds since the stream's first frame."""
         updates: list[Update] = []
-        for item in self._frames.push(frame.device_ms, frame.values):
+        for item in self._frames.push(frame.device_ms, frame.values, frame.host_ms):
             if isinstance(item, Sample):
                 updates += self._rules.push(item.inputs, item.time_us)
                 continue

@@ -13,6 +13,12 @@ A whole recording, a live stream and a toy's chip get identical samples, since a
    computed when the first frame at or after its time arrives, by linear interpolation between the two frames around
    it, rounded half up: ``x0 + floor((2 (x1 - x0) (t - t0) + (t1 - t0)) / (2 (t1 - t0)))``. Of several frames with
    equal times, the first ends the interval before them, and the last starts the interval after them.
+4. A new segment of rule 1 begins after a *reboot* if, since the frame `STALE_FRAMES` before, of those not left out, the
+   clock of the host went on by `LONG_PAUSE_MS` or more, and that of the device by less than half of it, or back: the
+   device was off, and may have another sensor now. After a pause, drivers may first give frames that they had kept from
+   before it. All that is known of the sensors (`plushsense.windows.self_calibration`) is then forgotten, too; a gap, or
+   a clock that was reset without such a pause, leaves it as it is. Frames without a clock of the host, as on a chip,
+   show no reboot: ``plush_recalibrate`` tells the C of one.
 
 For a live stream the clock also measures the interval between the frames, as a toy does.
 """
@@ -20,8 +26,10 @@ For a live stream the clock also measures the interval between the frames, as a 
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +38,10 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.row_times import kept_rows
 
+LONG_PAUSE_MS = 600_000
+"""Duration after which another sensor is likely; ``docs/people.md`` has the measurement."""
+STALE_FRAMES = 256
+"""Number of frames that a driver may keep over a pause: more than fit into 4 KiB."""
 _MOST_INTERVAL = (1 << 16) - 1
 
 
@@ -55,13 +67,35 @@ def row_times_us(frames: Frames, layout: Layout) -> NDArray[np.int64]:
     return times[np.minimum(np.searchsorted(kept, np.arange(len(frames))), len(kept) - 1)]
 
 
+def is_reboot(before: Frames, after: Frames) -> bool:
+    """Return whether a device was rebooted between two recordings, by rule 4; False without a clock of the host."""
+    if before.host_ms is None or after.host_ms is None or not len(before) or not len(after):
+        return False
+    steps = (int(getattr(after, name)[0] - getattr(before, name)[-1]) for name in ("device_ms", "host_ms"))
+    return bool(_over_reboot(*steps))
+
+
+def reboots(device_ms: NDArray[np.int64], host_ms: NDArray[np.int64] | None, gap_ms: float) -> NDArray[np.bool_]:
+    """Return which frames (T,), of those that rule 1 keeps, are the first after a reboot."""
+    if host_ms is None:
+        return np.zeros(len(device_ms), dtype=np.bool_)
+    step, before = np.diff(device_ms, prepend=device_ms[:1]), np.maximum(np.arange(len(device_ms)) - STALE_FRAMES, 0)
+    steps = (clock - clock[before] for clock in (device_ms, host_ms))
+    return np.asarray(((step < 0) | (step > gap_ms)) & _over_reboot(*steps))
+
+
+def _over_reboot(step_ms: Any, host_step_ms: Any) -> Any:
+    return (host_step_ms >= LONG_PAUSE_MS) & (2 * step_ms < host_step_ms)
+
+
 @dataclass(frozen=True)
 class Segment:
     """Evenly spaced samples without a break.
 
     ``data`` (n, C) are the samples; ``start_us`` is the device time of sample 0; ``first_row`` to ``last_row``
     (exclusive) are the source rows used; ``row_of`` (n,) is the source row that completed each sample; ``invalid`` is
-    the number of values outside their valid range.
+    the number of values outside their valid range; ``rebooted``: whether the device was rebooted since the segment
+    before.
     """
 
     data: NDArray[np.int64]
@@ -71,6 +105,7 @@ class Segment:
     last_row: int
     row_of: NDArray[np.int64]
     invalid: int
+    rebooted: bool = False
 
     def __len__(self) -> int:
         return len(self.data)
@@ -89,6 +124,7 @@ class SampleClock:
         sparse: whether the interval is more than two periods, so that most samples are made up.
         left_out: whether rule 1 left the newest frame out.
         restarted: whether the newest frame started a new segment because of a gap or a clock reset.
+        rebooted: whether it did so after a reboot.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -98,7 +134,7 @@ class SampleClock:
         self._gap = layout.gap_ms * 1000
         self.restarts = self.invalid = self.bad_stamps = self.interpolated = 0
         self.interval = 0
-        self.left_out = self.restarted = self.sparse = False
+        self.left_out = self.restarted = self.rebooted = self.sparse = False
         self._follows = False  # the frame before was in order
         self._seen_us: int | None = None
         self.restart()
@@ -106,6 +142,7 @@ class SampleClock:
     def restart(self) -> None:
         """Start a new segment with the next frame, whatever its time."""
         self._seen_us, self._follows = None, False
+        self._recent = deque[tuple[int, int]](maxlen=STALE_FRAMES)  # device and host time of the newest frames
         self.forget()
 
     def forget(self) -> None:
@@ -129,8 +166,8 @@ class SampleClock:
         rows = self.samples(values) if self.accept(device_ms) else []
         return [np.array(row, dtype=np.int64) for row in rows]
 
-    def accept(self, device_ms: int) -> bool:
-        """Apply rule 1 to the time of the next frame; return False if the frame is left out."""
+    def accept(self, device_ms: int, host_ms: int | None = None) -> bool:
+        """Apply rules 1 and 4 to the times of the next frame; return False if the frame is left out."""
         time = int(device_ms) * 1000
         step = 0 if self._seen_us is None else time - self._seen_us
         late, in_order = -self._gap <= step < 0, 0 <= step <= self._gap
@@ -140,7 +177,12 @@ class SampleClock:
         if not late:
             self._follows = not self.left_out
         if not self.left_out:
-            self._seen_us = time
+            self._seen_us, self.rebooted = time, False
+            if host_ms is not None:
+                if self.restarted and self._recent:
+                    before, host_before = self._recent[0]
+                    self.rebooted = bool(_over_reboot(int(device_ms) - before, host_ms - host_before))
+                self._recent.append((int(device_ms), host_ms))
         return not self.left_out
 
     def count_from(self, other: SampleClock) -> None:
@@ -204,11 +246,15 @@ def resample(frames: Frames, layout: Layout) -> list[Segment]:
     step = np.diff(time)
     breaks = np.flatnonzero((step < 0) | (step > layout.gap_ms * 1000)) + 1
     edges = [0, *breaks.tolist(), len(time)]
-    segments = []
+    host_ms = None if frames.host_ms is None else frames.host_ms[rows]
+    rebooted = reboots(frames.device_ms[rows], host_ms, layout.gap_ms)
+    segments, forgets = [], False
     for first, last in itertools.pairwise(edges):
         segment = _segment(time[first:last], values[first:last], layout, rows[first:last])
+        forgets |= bool(rebooted[first])
         if segment is not None:
-            segments.append(segment)
+            segments.append(replace(segment, rebooted=forgets))
+            forgets = False
     return segments
 
 

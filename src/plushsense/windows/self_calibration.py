@@ -2,8 +2,9 @@
 
 In integers, and causal. A channel of ``Layout.self_calibration`` becomes ``(reading - offset) * UNIT / scale``, so that
 readings with another gain above 0 and another offset give the same numbers but for rounding. Until the first block of
-about 0.3 s is complete, the output is 0. The state survives gaps, and is cleared by a new stream. Quotients are rounded
-toward 0. ``deploy/c/plushsense.c`` computes the same.
+about 0.3 s is complete, the output is 0. The state survives gaps and resets of the clock; a new stream and a reboot
+(rule 4 of `plushsense.windows.clock`) clear it. Quotients are rounded toward 0. ``deploy/c/plushsense.c`` computes the
+same.
 
 Samples are taken in blocks. A block gives the mean m of each axis and their variance within the block. Its weight is
 ``(level / (variance + level))²``; the level follows the variance of the stillest blocks: it falls by 1/4 where a block
@@ -44,11 +45,13 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import ACCELERATION, Layout
+from plushsense.windows.clock import Segment
 
 UNIT = 2048  # of the output: 1 g, or the spread
 MOST_OUTPUT = 32767
@@ -339,6 +342,12 @@ class SelfCalibration:
                 sample[axis] = self._zeros[axis] + fit.output(number, x[number])
             fit.add(x)
         return sample
+
+    def calibrated(self, segment: Segment) -> Segment:
+        """Return the next segment of a stream with calibrated channels."""
+        if segment.rebooted:
+            self.reset()
+        return replace(segment, data=self.apply(segment.data))
 
     def apply(self, data: Ints) -> Ints:
         """Return consecutive samples (T, C) with calibrated channels; the same as `push` of each."""

@@ -2,8 +2,9 @@
 
 Without a self-calibration in the layout (`plushsense.windows.self_calibration`), these are the samples of
 `plushsense.windows.clock.resample`. With one, its state at the beginning of a recording is what all earlier frames of
-the person's session gave: those of the stream that contains it, or else the earlier recordings of the session, by time,
-without excluded ones. A recording with nothing before it, or of nobody, uses only itself. So every score is causal.
+the person's session gave since the last reboot (rule 4 of the clock): those of the stream that contains it, or else the
+earlier recordings of the session, by time, without excluded ones. A recording with nothing before it, or of nobody,
+uses only itself. So every score is causal.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.quality.measurements import rows_at_one_time
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
-from plushsense.windows.clock import Segment, resample
+from plushsense.windows.clock import Segment, is_reboot, resample
 from plushsense.windows.self_calibration import SelfCalibration
 
 
@@ -38,6 +39,8 @@ class SessionReader:
         mine.sort(key=lambda r: r.stream_row + r.start)
         state, calibrated = SelfCalibration(dataset.layout), []
         for segment in segments:
+            if segment.rebooted:
+                state.reset()
             parts, at = [], 0
             while mine and mine[0].stream_row + mine[0].start <= segment.row_of[-1]:
                 begin = int(np.searchsorted(segment.row_of, mine[0].stream_row + mine[0].start, side="left"))
@@ -62,7 +65,7 @@ class SessionReader:
         if recording.id not in self._states:
             self._follow(recording)
         state = self._states[recording.id].copy()
-        return [replace(segment, data=state.apply(segment.data)) for segment in segments]
+        return [state.calibrated(segment) for segment in segments]
 
     def _follow(self, recording: RecordingInfo) -> None:
         """Store the state at the beginning of all recordings of the same stream, or session."""
@@ -79,9 +82,13 @@ class SessionReader:
             if (r.subject, r.session) == (recording.subject, recording.session) and r.stream_row < 0
         ]
         session.sort(key=lambda r: (r.epoch_ms, r.start_ms, r.id))
-        read = {r.id: [] if r.excluded else resample(dataset.read(r), dataset.layout) for r in session}
-        state = SelfCalibration(dataset.layout)
-        for r in session:
+        read = [dataset.read(r) for r in session]
+        state, before = SelfCalibration(dataset.layout), None
+        for r, frames in zip(session, read, strict=True):
+            if before is not None and is_reboot(before, frames):
+                state.reset()
             self._states[r.id] = state.copy()
-            for segment in read[r.id]:
-                state.apply(segment.data)
+            if not r.excluded:
+                before = frames
+                for segment in resample(frames, dataset.layout):
+                    state.calibrated(segment)

@@ -5,8 +5,8 @@
  * What is fed are cases, one after the other, of 32-bit little-endian numbers: the bytes of a model, and the model, filled
  * up to whole numbers (0 bytes: the export's own); then, again and again, how many frames, and each: milliseconds, then
  * the measured channels; and what comes after them: 0, the case ends; 1, a silence; 2, a patch: its bytes, and the patch,
- * filled up (0 bytes: the model's own layer is brought back); 3, the toy is primed with a frame; 4, a sensitivity. What is
- * written are rows of the same kind:
+ * filled up (0 bytes: the model's own layer is brought back); 3, the toy is primed with a frame; 4, a sensitivity; 5, its
+ * sensors are calibrated anew. What is written are rows of the same kind:
  *
  *     0, frame, ms, sample, state, gesture, affect, confidence, answer, known, counts, logits x classes,
  *         smooth x classes; while warming all from gesture to known is 0, and logits and smooth
@@ -40,7 +40,7 @@
 #define POISON UINT32_C(0xa5c35a3c)
 
 /* What comes after frames. */
-enum { END = 0, SILENCE = 1, PATCH = 2, PRIME = 3, SENSITIVITY = 4 };
+enum { END = 0, SILENCE = 1, PATCH = 2, PRIME = 3, SENSITIVITY = 4, RECALIBRATE = 5 };
 
 #ifdef PLUSH_HARNESS_DEVICE
 #include "plush_device.h"
@@ -334,6 +334,8 @@ static int feed(void)
             due += on_prime();
         else if (what == SENSITIVITY)
             toy.sensitivity = (int8_t)((int32_t)((next_number() + 128u) & 255u) - 128);
+        else if (what == RECALIBRATE)
+            plush_recalibrate(&toy);
         frame++;
     } while (what != END);
     return (due == answers && toy.answers == answers) ||

@@ -757,11 +757,12 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
  * and the low 24 bits of a - 2^8 c are s0, from which the others follow: see activations(). Other instructions may have other
  * sums.
  *
- *     PLUSH_ALONE            the next 4 activations at `x`, times the weights of 4 filters at `w`: words of the channels
+ *     PLUSH_ALONE(i)         4 activations at `x` + i, times the next weights of 4 filters at `w`: words of the channels
  *                            0, 2, 1 and 3
- *     PLUSH_PAIR             the same at `x` and at `y`: a weight is loaded once for two positions
+ *     PLUSH_PAIR(i)          the same at `x` and at `y`: a weight is loaded once for two positions
  *     PLUSH_SUMS(s)          what is summed up at `x`, and `t` at `y`; PLUSH_GIVE puts it into `sum`
  *     PLUSH_SUM_BYTES(s, v)  the four bytes of a word, into `s`
+ *     PLUSH_RELU(v, n)       a number, at least 0, divided by 2^n; it goes to PLUSH_LIMIT
  *     PLUSH_LIMIT(v, bits)   a number below 2^31, at most the highest of so many bits
  *
  * PLUSH_PLAIN asks for plain C everywhere. */
@@ -769,6 +770,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 
 #define PLUSH_DSP
 #define PLUSH_SUM_BYTES(s, v) __asm__("usada8 %0, %1, %2, %0" : "+r"(s) : "r"(v), "r"(0))
+#define PLUSH_RELU(v, n) ((uint32_t)((v) >> (n))) /* PLUSH_LIMIT makes a negative number 0 */
 #define PLUSH_LIMIT(v, bits) __asm__("usat %0, %1, %0" : "+r"(v) : "i"(bits))
 
 /* Two halves in a register, of two channels: weights of filters 0 and 1 in `a`, of 2 and 3 in `b`, of 1 and 2 in `c`. A
@@ -788,7 +790,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
                      : [p] "+&r"(x), [i] "+&r"(s), [j] "+&r"(t), [k] "+&r"(u), [d] "=&r"(d)                \
                      : [a] "r"(a), [b] "r"(b), [c] "r"(c)                                                  \
                      : "memory")
-#define PLUSH_ALONE                                                \
+#define PLUSH_ALONE(i)                                             \
     do {                                                           \
         uint32_t a, b, c, d;                                       \
         PLUSH_WEIGHTS;                                             \
@@ -796,7 +798,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         PLUSH_WEIGHTS;                                             \
         PLUSH_PRODUCTS(x, ", #4", ", ror #8", s0, s1, s2);         \
     } while (0)
-#define PLUSH_PAIR                                                 \
+#define PLUSH_PAIR(i)                                              \
     do {                                                           \
         uint32_t a, b, c, d;                                       \
         PLUSH_WEIGHTS;                                             \
@@ -830,14 +832,13 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         a = _mm_unpacklo_epi8(_mm_cvtsi32_si128(four), zero);                           \
         (s) = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x00), b));          \
         (s) = _mm_add_epi32(s, _mm_madd_epi16(_mm_shuffle_epi32(a, 0x55), c));          \
-        (x) += 4;                                                                       \
     } while (0)
-#define PLUSH_ALONE           \
+#define PLUSH_ALONE(i)        \
     do {                      \
         PLUSH_WEIGHTS;        \
         PLUSH_PRODUCTS(x, s); \
     } while (0)
-#define PLUSH_PAIR            \
+#define PLUSH_PAIR(i)         \
     do {                      \
         PLUSH_WEIGHTS;        \
         PLUSH_PRODUCTS(x, s); \
@@ -857,8 +858,6 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 #define PLUSH_NEXT_WORD(v) __asm__ volatile("ldmia %0!, {%1}" : "+l"(w), "=l"(v) : : "memory")
 #elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__) && !(defined(__AVR__) && defined(__clang__))
 #define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
-#else
-#define PLUSH_KEEP(v) ((void)0)
 #endif
 #ifndef PLUSH_ADD
 #define PLUSH_ADD(s, v) \
@@ -904,13 +903,12 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         PLUSH_ADD(s0, a);           \
     } while (0)
 #endif
-#define PLUSH_ALONE       \
-    do {                  \
-        PLUSH_CHANNEL(0); \
-        PLUSH_CHANNEL(2); \
-        PLUSH_CHANNEL(1); \
-        PLUSH_CHANNEL(3); \
-        x += 4;           \
+#define PLUSH_ALONE(i)          \
+    do {                        \
+        PLUSH_CHANNEL(i);       \
+        PLUSH_CHANNEL((i) + 2); \
+        PLUSH_CHANNEL((i) + 1); \
+        PLUSH_CHANNEL((i) + 3); \
     } while (0)
 #ifndef __AVR__
 #if defined(__thumb__) && !defined(__thumb2__)
@@ -960,14 +958,12 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         PLUSH_ADD(t2, b);              \
     } while (0)
 #endif
-#define PLUSH_PAIR                \
-    do {                          \
-        PLUSH_CHANNEL_OF_PAIR(0); \
-        PLUSH_CHANNEL_OF_PAIR(2); \
-        PLUSH_CHANNEL_OF_PAIR(1); \
-        PLUSH_CHANNEL_OF_PAIR(3); \
-        x += 4;                   \
-        y += 4;                   \
+#define PLUSH_PAIR(i)                   \
+    do {                                \
+        PLUSH_CHANNEL_OF_PAIR(i);       \
+        PLUSH_CHANNEL_OF_PAIR((i) + 2); \
+        PLUSH_CHANNEL_OF_PAIR((i) + 1); \
+        PLUSH_CHANNEL_OF_PAIR((i) + 3); \
     } while (0)
 
 #endif
@@ -983,12 +979,45 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         (sum)[2] = s##2;     \
     } while (0)
 #endif
+#ifndef PLUSH_KEEP
+#define PLUSH_KEEP(v) ((void)0)
+#endif
+#ifdef PLUSH_DSP /* whose loads set the pointers on */
+#define PLUSH_MOVE(by) ((void)0)
+#define PLUSH_MOVE_BOTH(by) ((void)0)
+#else
+#define PLUSH_MOVE(by) (x += (by))
+#define PLUSH_MOVE_BOTH(by) (x += (by), y += (by))
+#endif
+/* All activations up to `end`, 4 a turn; on Thumb, where a turn costs much, 8: an odd 4 begin in the middle. */
+#ifdef __thumb__
+#define PLUSH_TURNS(four, move)   \
+    do {                          \
+        if ((end - x) % 8 != 0) { \
+            move(-4);             \
+            goto middle;          \
+        }                         \
+        do {                      \
+            four(0);              \
+        middle:                   \
+            four(4);              \
+            move(8);              \
+        } while (x != end);       \
+    } while (0)
+#else
+#define PLUSH_TURNS(four, move) \
+    do {                        \
+        four(0);                \
+        move(4);                \
+    } while (x != end)
+#endif
 #ifndef PLUSH_DSP
 #define PLUSH_SUM_BYTES(s, v)                                                      \
     do {                                                                           \
         uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
         (s) += two * 0x10001u >> 16;                                               \
     } while (0)
+#define PLUSH_RELU(v, n) ((uint32_t)((v) > 0 ? (v) : 0) >> (n))
 #define PLUSH_LIMIT(v, bits)                     \
     do {                                         \
         if ((v) >> (bits) != 0)                  \
@@ -1055,9 +1084,7 @@ static void alone(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32
 {
     PLUSH_SUMS(s);
 
-    do
-        PLUSH_ALONE;
-    while (x != end);
+    PLUSH_TURNS(PLUSH_ALONE, PLUSH_MOVE);
     PLUSH_GIVE(s, sum);
 }
 
@@ -1069,9 +1096,7 @@ static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const u
     PLUSH_SUMS(s);
     PLUSH_SUMS(t);
 
-    do
-        PLUSH_PAIR;
-    while (x != end);
+    PLUSH_TURNS(PLUSH_PAIR, PLUSH_MOVE_BOTH);
     PLUSH_GIVE(s, sum);
     PLUSH_GIVE(t, sum + GROUP);
 #else
@@ -1084,7 +1109,7 @@ static void pair(const uint8_t *x, const uint8_t *end, const uint8_t *y, const u
 PLUSH_CODE
 static uint32_t requantize(int32_t sum, uint32_t times, uint32_t before, uint32_t after)
 {
-    uint32_t t = (uint32_t)(sum > 0 ? sum : 0) >> before;
+    uint32_t t = PLUSH_RELU(sum, before);
 
     PLUSH_LIMIT(t, 16);
     t = ((2u * t * times >> after) + 1u) >> 1;
@@ -1114,9 +1139,13 @@ static void activations(uint32_t sum[GROUP], uint32_t extra, const uint8_t *scal
     sum[2] = PLUSH_DOWN(c - sum[1], 8);
     sum[3] = PLUSH_DOWN(b - sum[2], 8);
 #endif
-    for (; n > 0; n--, scale += SCALE_BYTES)
-        *out++ = (uint8_t)requantize(as_signed(*sum++ + aligned_le32(scale)), aligned_le32(scale + 4) & 0xffffu, scale[6],
-                                     scale[7]);
+    for (; n > 0; n--, scale += SCALE_BYTES) {
+        int32_t total = as_signed(*sum++ + aligned_le32(scale));
+        uint32_t v = requantize(total, aligned_le32(scale + 4) & 0xffffu, scale[6], scale[7]);
+
+        PLUSH_KEEP(v); /* below 256: gcc does not see it */
+        *out++ = (uint8_t)v;
+    }
 }
 
 /* A new position of a layer, (filters) activations, or two: then `before` are those of the older one. */
@@ -2104,6 +2133,14 @@ void plush_restart(plush_toy *toy)
     toy->follows = 0;
     toy->seen_ms = 0;
 }
+
+#ifdef PLUSH_CALIBRATE
+PLUSH_SMALL void plush_recalibrate(plush_toy *toy)
+{
+    if (toy->held != NULL)
+        begin_sensors(toy);
+}
+#endif
 
 PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes)

@@ -298,8 +298,17 @@ uint8_t plush_probability(const plush_toy *toy, uint8_t gesture);
 void plush_silence(plush_toy *toy);
 
 /* Forgets the past, as after a gap: what is going on ends; the counts stay, and so do a fault and what sensors that calibrate
- * themselves have found out, which only plush_begin() and plush_swap() forget. */
+ * themselves have found out, which only plush_begin(), plush_swap() and plush_recalibrate() forget. */
 void plush_restart(plush_toy *toy);
+
+/* What sensors that calibrate themselves have found out is forgotten, and nothing else. A chip that boots has forgotten it
+ * by itself. For a program that outlives the sensors: call it before the first frame of a toy that was off for 10 minutes
+ * or longer (its clock went back, or on by less than half of the pause), as `plushsense live` does, or with other sensors. */
+#ifdef PLUSH_CALIBRATE
+void plush_recalibrate(plush_toy *toy);
+#else
+#define plush_recalibrate(toy) ((void)(toy)) /* no sensor of this model does */
+#endif
 
 /* The label of a class, and of the model (its architecture and filters). */
 const char *plush_gesture_name(const plush_toy *toy, uint8_t gesture);

@@ -3,7 +3,8 @@
 On generated frames the rules of a trained model rarely apply, so that an error in their C would not be detected. A
 scenario keeps the layers and the input scale of the model. It shifts and scales the logits so that each class is
 sometimes the best one, changes affects and idle classes, and chooses the thresholds of health, gate and events from
-quantiles of the generated frames. Patches of the last layer are offered to the model itself.
+quantiles of the generated frames. Patches of the last layer are offered to the model itself, and its sensors, if they
+calibrate themselves, are exchanged.
 """
 
 from __future__ import annotations
@@ -130,6 +131,25 @@ def patches_of(model: IntegerModel, scaler: Scaler) -> Vectors:
     rows = np.concatenate(answers_over_patches(model, parts, [status for _, status, _ in offers]))
     patches = tuple((cut - 1, patch) for cut, (patch, _, _) in zip(cuts, offers, strict=True))
     return Vectors("patch", frames, rows, samples_of(frames, model.layout), patches=patches)
+
+
+def exchanges_of(model: IntegerModel, scaler: Scaler) -> Vectors:
+    """Generate frames over glitches, resets of the clock, a reboot with another sensor, and an exchange of sensors."""
+    generator, part = FrameGenerator(model.layout, scaler, np.random.default_rng(1)), model.network.arch.span + 300
+    calls = []
+    generator.touches(part)
+    generator.strays()
+    generator.now = 7
+    generator.touches(part)
+    generator.now = 3
+    for way in (1, -1):  # first with a reboot, then in the middle of the stream
+        calls.append(Call(len(generator.rows) - 1, "recalibrate"))
+        generator.mean = generator.mean + 3 * way * generator.spread
+        generator.spread = generator.spread * 2.0**-way
+        generator.touches(part)
+    frames = np.array(generator.rows, dtype=np.int64)
+    answers = answers_of(model, frames, calls)
+    return Vectors("exchange", frames, answers, samples_of(frames, model.layout), calls=tuple(calls))
 
 
 def _scenario(plain: IntegerModel, scaler: Scaler, settings: _ScenarioSettings, seed: int) -> Vectors:

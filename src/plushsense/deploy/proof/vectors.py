@@ -31,7 +31,7 @@ from plushsense.deploy.code import (
 )
 from plushsense.deploy.golden import COLUMNS, HEAD, Vectors, answers_of, golden_frames, read_golden, samples_of
 from plushsense.deploy.package import export_files, foreign_files
-from plushsense.deploy.proof.scenarios import patches_of, scenarios_of
+from plushsense.deploy.proof.scenarios import exchanges_of, patches_of, scenarios_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.deploy.web import MODULE
 from plushsense.devices.virtual.stream import ToySpec, received
@@ -228,7 +228,8 @@ class Export:
 
     @cached_property
     def _scenarios(self) -> list[Vectors]:
-        return scenarios_of(self.model, self.bundle.scaler)
+        exchanges = [exchanges_of(self.model, self.bundle.scaler)] if self.model.layout.self_calibration else []
+        return [*scenarios_of(self.model, self.bundle.scaler), *exchanges]
 
     @cached_property
     def _patched(self) -> Vectors:

@@ -33,9 +33,10 @@ const LATVIAN = {
   "The toy sends lines that cannot be read, as “{line}”: this page expects {n} whole or decimal numbers a line, at 115200 baud.": "Rotaļlieta sūta rindas, ko nevar nolasīt, piemēram, „{line}”: šī lapa gaida {n} skaitļus rindā ar ātrumu 115200 bodi.",
   "The toy went away ({why}). Switch it on or plug it in, and connect again.": "Rotaļlieta ir pazudusi ({why}). Ieslēdziet vai pievienojiet to un savienojiet vēlreiz.",
   "The toy could not be connected ({why}). Close other programs that use it, and try again.": "Rotaļlietu neizdevās savienot ({why}). Aizveriet citas programmas, kas to lieto, un mēģiniet vēlreiz.",
+  "Simulated data are not recorded here, as the file could not say so: use plushsense record.": "Simulētus datus šeit neieraksta, jo datne to nevarētu pateikt: lietojiet plushsense record.",
   "No toy was chosen.": "Rotaļlieta nav izvēlēta.", "“{file}” is over.": "„{file}” ir beidzies.", "Playing “{file}”, a recording.": "Atskaņo „{file}”, ierakstu.", "Reading the toy.": "Nolasa rotaļlietu.",
   "“{file}” cannot be played: it is not a recording with the columns or lines of layout {layout}.": "„{file}” nevar atskaņot: tas nav ieraksts ar izkārtojuma {layout} slejām vai rindām.",
-  "“{file}” is larger than {mb} MB; play a part of it.": "„{file}” ir lielāks par {mb} MB; atskaņojiet daļu no tā.", "Lines left out: {n}.": "Izlaistas rindas: {n}.",
+  "“{file}” is larger than {mb} MB; play a part of it.": "„{file}” ir lielāks par {mb} MB; atskaņojiet daļu no tā.",
   "This browser cannot run the model: {why}": "Šī pārlūkprogramma nevar darbināt modeli: {why}", "{n} frames": "{n} kadri",
   "At rest": "Miera stāvoklī", "Back stroke": "Muguras glāstīšana", "Ear scratch": "Ausu kasīšana", "Head stroke": "Galvas glāstīšana", "Hold in hands": "Turēšana rokās", "Hold strong": "Cieša apskaušana",
   "Neck scratch": "Kakla kasīšana", "Tail hit": "Uzsitiens pie astes", "Tail pull": "Astes raušana", "Tail scratch": "Kasīšana pie astes", "Tail tap": "Viegla uzsišana pie astes",
@@ -76,11 +77,10 @@ class LineParser {
     const pieces = text.split(/[\n\r]/), last = pieces.pop(), frames = [];
     for (const piece of pieces) {
       this.keep(piece);
-      const frame = this.take();
-      if (frame) frames.push(frame);
+      frames.push(this.take());
     }
     this.keep(last);
-    return frames;
+    return frames.filter(Boolean);
   }
 
   keep(piece) {
@@ -99,12 +99,10 @@ class LineParser {
     if (!numbers) return this.refuse(joined ? "" : line, fields);
     this.unreadable = this.others = 0;
     if (joined) return null;
-    let ms = numbers[this.clockAt];
-    if (this.clockAt < 0) {
-      this.clock += this.frames ? numbers[this.delayAt] : 0; // the first delay is from a frame that was not read
-      ms = this.clock = this.clock > MOST ? 0 : this.clock;
-    }
-    const values = this.at.map((at) => numbers[at]);
+    // Without a clock, delays are added up; the first is from a frame that was not read.
+    this.clock += this.frames && this.clockAt < 0 ? numbers[this.delayAt] : 0;
+    if (this.clock > MOST) this.clock = 0;
+    const ms = numbers[this.clockAt] ?? this.clock, values = this.at.map((at) => numbers[at]);
     this.frames++;
     this.garbage += values.some((v, i) => v < channels[i].low || v > channels[i].high);
     return { ms, values };
@@ -241,7 +239,7 @@ async function begin(source) {
 
 async function stop(sentence = "") {
   const old = run;
-  if (!old || old.over) return;
+  if (old?.over ?? true) return;
   old.over = true;
   old.toy.silence(); // ends what is going on
   $("stop").disabled = $("record").disabled = true;
@@ -351,9 +349,8 @@ async function fromFile(chosen) {
       due = next;
     }
     take(own, frames.slice(from, at));
-    if (own.over) return;
-    if (at < frames.length) return void setTimeout(play, 20);
-    stop(t("“{file}” is over.", { file: chosen.name }));
+    if (at < frames.length) own.over || setTimeout(play, 20);
+    else if (!own.over) stop(t("“{file}” is over.", { file: chosen.name }));
   };
   play();
 }
@@ -388,6 +385,7 @@ function row(ms, values) {
 }
 
 function record() {
+  if (!rows && $("simulated").checked) return say("message", t("Simulated data are not recorded here, as the file could not say so: use plushsense record."));
   if (!rows) rows = Object.assign([], { label: $("gesture").value });
   else {
     const name = rows.label.replace(/[\\/:*?"<>|()\x00-\x1f]/g, "_");

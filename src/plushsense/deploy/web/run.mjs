@@ -5,7 +5,7 @@ import { readFileSync, writeSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 
 const [folder, image, what] = process.argv.slice(2);
-const { open, STATES, AFFECTS, KINDS, WHATS, SOURCES } = await import(pathToFileURL(`${folder}/plushsense.js`));
+const { open, PlushError, STATES, AFFECTS, KINDS, WHATS, SOURCES } = await import(pathToFileURL(`${folder}/plushsense.js`));
 const END = 0, SILENCE = 1, PATCH = 2, PRIME = 3, SENSITIVITY = 4;
 const module = await WebAssembly.compile(readFileSync(`${folder}/plushsense.wasm`));
 const bytes = readFileSync(0);
@@ -64,6 +64,7 @@ async function run() {
     try {
       toy.patch(n ? nextBytes(n) : null);
     } catch (error) {
+      if (!(error instanceof PlushError)) throw error;
       status = error.status;
     }
     row(3, ms, [status, 0, 0, 0, 0, 0, 0]);
