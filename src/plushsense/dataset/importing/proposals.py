@@ -412,9 +412,8 @@ def _valid_ranges(dataset: Dataset) -> Iterator[Proposal]:
 def _drifts(dataset: Dataset) -> Iterator[Proposal]:
     """Propose self-calibration of channels, other than accelerations, whose rest differs between sessions.
 
-    Scaled over the training people, rest of such a session reads like touch of another. Where sessions differ by less,
-    self-calibration costs more than it brings, so that nothing is proposed. Sessions of one gesture tell nothing: what
-    differs may be the gesture.
+    Scaled over the training people, rest of such a session reads like touch of another. Sessions of one gesture tell
+    nothing: what differs may be the gesture.
     """
     layout = dataset.layout
     named = {axis: vector for vector in layout.vectors for axis in vector}
