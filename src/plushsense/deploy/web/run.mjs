@@ -6,7 +6,7 @@ import { pathToFileURL } from "node:url";
 
 const [folder, image, what] = process.argv.slice(2);
 const { open, PlushError, STATES, AFFECTS, KINDS, WHATS, SOURCES } = await import(pathToFileURL(`${folder}/plushsense.js`));
-const END = 0, SILENCE = 1, PATCH = 2, PRIME = 3, SENSITIVITY = 4;
+const END = 0, SILENCE = 1, PATCH = 2, PRIME = 3, SENSITIVITY = 4, RECALIBRATE = 5;
 const module = await WebAssembly.compile(readFileSync(`${folder}/plushsense.wasm`));
 const bytes = readFileSync(0);
 const cases = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
@@ -82,6 +82,7 @@ async function run() {
     else if (action === PATCH) patch();
     else if (action === PRIME) prime();
     else if (action === SENSITIVITY) toy.sensitivity = next() | 0;
+    else if (action === RECALIBRATE) toy.recalibrate();
     frame++;
     if (action === END) break;
   }
