@@ -52,11 +52,13 @@ LICENCE = "LICENSE"
 TWO_SLOTS = "examples/two_slots"
 ON_CHIP = "examples/verify_device"
 BINDING = "examples/binding"
+BUFFERED = "examples/fifo"
 # Examples without templates: their folders in `c`, and their files.
 _PLAIN = {
     TWO_SLOTS: ("two_slots", ("plush_update.h", "plush_update.c")),
     ON_CHIP: ("device", ("plush_device.h", "plush_device.c", "plush_hooks.c", "verify_device.ino")),
     BINDING: ("binding", ("plush_binding.h", "plush_binding.c", "plush_binding.rs")),
+    BUFFERED: ("fifo", ("plush_fifo.h", "plush_fifo.c")),
 }
 # Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
 NO_PAGE = "https://plushsense.invalid/"

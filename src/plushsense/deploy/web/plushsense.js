@@ -20,7 +20,7 @@
  *     counts()                 restarts, invalid values, faults, interval between readings, what became of the newest
  *     prime(values, ms)        begin again from a reading at rest, without warming
  *     silence(), restart()     no reading came for a while; forget the past, as after a gap
- *     recalibrate()            forget what sensors that calibrate themselves have found out, as after 10 minutes off
+ *     recalibrate()            other sensors, or the toy was off for long: sensors that calibrate themselves begin anew
  *     swap(model), patch(bytes or null)   another image for the same channels; the last layer of one person
  *     sensitivity              -128 to 127, 0: as trained
  *     onAnswer, onEvent        called with each, while push(), prime() and others run
@@ -323,8 +323,9 @@ export class Toy {
     this._c.plush_restart(this._toy);
   }
 
+  /** Forget what sensors that calibrate themselves have found out: the next readings are of others, or the toy was off. */
   recalibrate() {
-    this._c.plush_recalibrate?.(this._toy); // of a module for sensors that do
+    this._c.plush_recalibrate?.(this._toy); // which only the module for such sensors has
   }
 
   get sensitivity() {
