@@ -25,6 +25,7 @@ from plushsense.core.recorder_csv import (
     recording_filename,
 )
 from plushsense.core.row_times import kept_rows
+from plushsense.dataset.importing.guessing import guess_pattern
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
@@ -706,3 +707,21 @@ def test_a_check_is_one_function_and_one_line(copy: Path, monkeypatch: pytest.Mo
     assert all("holds more than 10 rows" in r.flags for r in dataset.recordings)
     assert result.counts()["by_check"] == {"long": 1}, "a finding about nearly every recording is reported once"
     assert "long" in "\n".join(overview(result))
+
+
+def test_rest_with_a_label_of_its_own_tells_the_gesture_of_a_file(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    for person in range(3):
+        for kind, name in enumerate(("press", "wipe", "tap")):
+            touch = np.repeat([0.0, 1.0] * 4, 60)[:, None] * rng.normal(30, 8, (480, 3))
+            values = 400 + 60 * kind + rng.normal(0, 2, (480, 3)) + touch
+            rows = ["time_ms,a,b,c,label"]
+            rows += [
+                f"{10 * i},{v[0]:.0f},{v[1]:.0f},{v[2]:.0f},{name if i // 60 % 2 else 'rest'}"
+                for i, v in enumerate(values)
+            ]
+            (tmp_path / f"SRC/P{person}").mkdir(parents=True, exist_ok=True)
+            (tmp_path / f"SRC/P{person}/{name}.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    done = import_recordings(tmp_path / "SRC", tmp_path / "DS", pattern=guess_pattern(tmp_path / "SRC").pattern)
+    found = check(done.dataset, only=["rest-tells"]).findings
+    assert [float(str(f.message).split("tells ")[1].split()[0]) > 80 for f in found] == [True]

@@ -594,18 +594,25 @@ def rest_tells(w: DatasetSummary) -> Iterator[Issue]:
     """Report whether the rest before the touch already tells the gesture: a control that should only guess.
 
     Each recording that begins at rest gets the gesture of the one with the most similar mean of its first 0.3 s, among
-    those of other people, or of all if only one person has such recordings.
+    those of other people, or of all if only one person has such recordings. A recording that is at rest throughout
+    counts for the gesture of its session, if that has only one.
     """
-    rests = []
-    for o in w.recordings:
-        activity = w.activity(o)
-        peak = float(np.percentile(activity, 95)) if len(activity) else 0.0
-        if peak >= _SOMETHING and activity[:START_HOPS].max() < _QUIET * peak:
-            rests.append(o)
-    gesture, subject = np.array([gesture_of(o) for o in rests]), np.array([o.info.subject for o in rests])
+    peaks = [float(np.percentile(a, 95)) if len(a := w.activity(o)) else 0.0 for o in w.recordings]
+    made: dict[tuple[str, str], set[str]] = {}
+    for o, peak in zip(w.recordings, peaks, strict=True):
+        if peak >= _SOMETHING:
+            made.setdefault((o.info.subject, o.info.session), set()).add(gesture_of(o))
+    rests: list[tuple[RecordingSummary, str]] = []
+    for o, peak in zip(w.recordings, peaks, strict=True):
+        alone = made.get((o.info.subject, o.info.session), set())
+        if peak >= _SOMETHING and w.activity(o)[:START_HOPS].max() < _QUIET * peak:
+            rests.append((o, gesture_of(o)))
+        elif peak < _SOMETHING and len(alone) == 1:
+            rests.append((o, next(iter(alone))))
+    gesture, subject = np.array([label for _, label in rests]), np.array([o.info.subject for o, _ in rests])
     if len(rests) < _RESTS or len(set(gesture.tolist())) < 2:
         return
-    start = np.array([o.start for o in rests])
+    start = np.array([o.start for o, _ in rests])
     start /= np.maximum(start.std(axis=0), 1e-9)
     apart = subject[:, None] != subject if len(set(subject.tolist())) > 1 else ~np.eye(len(rests), dtype=bool)
     right = [
