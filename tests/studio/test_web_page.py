@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import IntegerClassifier
 from plushsense.runtime.image import IntegerModel
 from plushsense.studio.app.words import Words
+from plushsense.windows.clock import LONG_PAUSE_MS
 from support.browsing import KEPT, PHONE, Look, Studio, axe, english, keep_picture, marked
 from support.exports import bundle_of, exported
 from support.requirements import LONG
@@ -101,7 +102,7 @@ def pages(look: Callable[..., Look], tmp_path: Path) -> Iterator[Callable[..., O
         model = integer_model(bundle)
         image = model.to_bytes()
         file = tmp_path / "index.html"
-        content = web_files(bundle, facts_of(model, bundle, image), image, module(calibrate=False))
+        content = web_files(bundle, facts_of(model, bundle, image), image, module(calibrate=bool(bundle.layout.self_calibration)))
         file.write_bytes(next(text for name, text in content.items() if name == PAGE))
         looking = look(own=True, **how)
         looking.context.set_offline(True)
@@ -187,6 +188,36 @@ def test_the_page_decides_as_live_int8_on_the_same_bytes(pages: Callable[..., Op
     assert got["bad"] == parser.counters.malformed == 3
     opened.until("counts", f"{n:d}")
     assert opened.page.evaluate("() => plushPage.run.toy.counts().restarts") == 1
+
+
+def test_after_a_reboot_sensors_calibrate_themselves_anew_as_in_live(
+    pages: Callable[..., Opened], tmp_path: Path
+) -> None:
+    """By the browser's clock, and by that of a recording, of which one frame has an impossible time."""
+    layout = replace(_PLUSH, self_calibration=_PLUSH.names)
+    opened = pages(bundle_of(layout, window=60))
+    page, start = opened.page, 1_700_000_000_000
+    parts = [_stream(_PLUSH, 6, person) for person in (3, 4)]
+    hosts = (start, start + LONG_PAUSE_MS + 10_000)
+    frames = [Frame(host, f.device_ms, f.values) for host, part in zip(hosts, parts, strict=True) for f in part]
+    frames[900] = frames[900]._replace(device_ms=10**9)
+    expected = [step[1:] for step in _answers(IntegerClassifier(opened.model), frames)[0]]
+    assert expected[-1] != _answers(IntegerClassifier(opened.model), [f._replace(host_ms=0) for f in frames])[0][-1][1:]
+    opened.connect()
+    for host, part in ((hosts[0], frames[:600]), (hosts[1], frames[600:])):
+        page.clock.set_fixed_time(host)
+        opened.send(b"\n" * (part[0] is frames[0]) + _bytes(_PLUSH, part))
+    tracking = "() => answers.splice(0).filter((a) => a[1] === 'tracking').map((a) => a.slice(1))"
+    assert page.evaluate(tracking) == expected
+    page.click("#stop")
+    page.clock.pause_at(hosts[1] + 1)
+    lines = [_PLUSH.csv.separator.join(map(str, [*f.values, f.host_ms, f.device_ms])) for f in frames]
+    text = "\n".join(["; ".join([*_PLUSH.names, "host_ms", "device_ms"]), *lines, ""])
+    page.set_input_files("#file", {"name": "fulldatastream.csv", "mimeType": "text/csv", "buffer": text.encode()})
+    opened.until("message", "Playing")
+    page.clock.run_for(20_000)
+    opened.until("message", "is over.")
+    assert page.evaluate(tracking) == expected
 
 
 @pytest.mark.parametrize("layout", ["plush-15", "plush-14", "phone-6"])

@@ -194,7 +194,7 @@ function readFile(bytes, name) {
   clock ??= delays?.map((delay) => (ms += delay)) ?? host;
   if (!rows.length || !clock) return null;
   const at = channels.map((c) => of.keys.indexOf(c.name));
-  return { malformed, frames: rows.map((row, n) => ({ ms: clock[n], values: at.map((i, c) => toEven(row[i] / channels[c].step)) })) };
+  return { malformed, frames: rows.map((row, n) => ({ ms: clock[n], host: host?.[n], values: at.map((i, c) => toEven(row[i] / channels[c].step)) })) };
 }
 
 // Reactions: live/reactions.Reactor, for the rules of the built-in profiles (an affect that has begun) -------------------
@@ -215,6 +215,7 @@ class Reactor {
 
 // A run: the frames of one source through the model ----------------------------------------------------------------------
 const SILENT_MS = 750, SHOWN_S = 10, MOST_MB = 64, MOST_ROWS = 20000, KEPT = Math.ceil(1.2 * SHOWN_S * layout.rate_hz);
+const STALE_FRAMES = 256, LONG_PAUSE_MS = 600000; // windows/clock
 const bytesOf = (id) => Uint8Array.from(atob($(id).textContent.trim()), (c) => c.charCodeAt(0));
 const module = WebAssembly.compile(bytesOf("module")), image = bytesOf("image");
 let run = null, rows = null; // rows: of the recording of frames that goes on
@@ -224,7 +225,7 @@ const ring = { s: new Float64Array(KEPT), y: channels.map(() => new Float64Array
 async function begin(source) {
   await stop();
   const toy = await open(image, await module);
-  const own = { source, toy, parser: new LineParser(true), reactor: new Reactor(), s: 0, ms: null, frames: 0, at: performance.now(), quiet: false, spans: [], log: [], eyes: "off", sound: "", until: 0 };
+  const own = { source, toy, parser: new LineParser(true), reactor: new Reactor(), recent: [], follows: false, s: 0, ms: null, frames: 0, at: performance.now(), quiet: false, spans: [], log: [], eyes: "off", sound: "", until: 0 };
   toy.onEvent = (event) => change(own, event);
   run = own;
   ring.n = 0;
@@ -250,16 +251,30 @@ async function stop(sentence = "") {
   await Promise.resolve(old.source.close?.()).catch(() => {});
 }
 
+/** Rules 1 and 4 of windows/clock: with the first frame after a reboot, sensors that calibrate themselves begin anew. */
+function noticeReboot(own, ms, host) {
+  const { recent } = own, step = ms - (recent.at(-1)?.ms ?? ms), gap = layout.gap_ms;
+  if (step < 0 && step >= -gap) return;
+  const ordered = step >= 0 && step <= gap, leftOut = own.follows && !ordered;
+  own.follows = !leftOut;
+  if (leftOut) return;
+  const paused = host - recent[0]?.host;
+  if (!ordered && paused >= LONG_PAUSE_MS && 2 * (ms - recent[0].ms) < paused) own.toy.recalibrate();
+  if (recent.push({ ms, host }) > STALE_FRAMES) recent.shift();
+}
+
 function take(own, frames) {
   if (own.over || !frames.length) return;
-  for (const { ms, values } of frames) {
+  const now = Date.now();
+  for (const { ms, values, host = now } of frames) {
     const step = ms - (own.ms ?? ms);
     [own.s, own.ms] = [own.s + (step < 0 ? period : step) / 1000, ms];
+    noticeReboot(own, ms, host);
     own.toy.push(values, ms);
     ring.s[ring.n % KEPT] = own.s;
     for (let i = 0; i < values.length; i++) ring.y[i][ring.n % KEPT] = values[i];
     ring.n++;
-    rows?.push(row(ms, values));
+    rows?.push(row(ms, values, host));
   }
   Object.assign(own, { frames: own.frames + frames.length, at: performance.now(), quiet: false });
   draw();
@@ -374,8 +389,8 @@ function save(name, lines) {
 }
 
 /** A row as the recorder writes it: core/recorder_csv.format_rows. */
-function row(ms, values) {
-  const clocks = { host_ms: Date.now(), device_ms: ms, delay_ms: rows.ms === undefined ? 0 : ms - rows.ms, label: rows.label };
+function row(ms, values, host) {
+  const clocks = { host_ms: host, device_ms: ms, delay_ms: rows.ms === undefined ? 0 : ms - rows.ms, label: rows.label };
   rows.ms = ms;
   return layout.csv.columns.map((key) => {
     if (key in clocks) return clocks[key];

@@ -106,15 +106,14 @@ export class PlushError extends Error {
  * @returns {Promise<Toy>}
  */
 export async function open(model, wasm) {
-  let code;
+  let toy;
   try {
-    code = wasm instanceof WebAssembly.Module ? wasm : await WebAssembly.compile(wasm ?? (await besideThis()));
+    const code = wasm instanceof WebAssembly.Module ? wasm : await WebAssembly.compile(wasm ?? (await besideThis()));
+    const instance = await WebAssembly.instantiate(code, { plush: { told: (what) => toy._told(what) } });
+    toy = new Toy(instance.exports);
   } catch (cause) {
     throw new PlushError(`The WebAssembly module cannot be used (${cause.message}): check plushsense.wasm, and that the browser is of 2021 or later.`);
   }
-  let toy;
-  const instance = await WebAssembly.instantiate(code, { plush: { told: (what) => toy._told(what) } });
-  toy = new Toy(instance.exports);
   toy._begin(model);
   return toy;
 }
@@ -231,12 +230,13 @@ export class Toy {
     this.onEvent?.(event);
   }
 
-  _reading(values) {
+  _reading(values, ms) {
+    if (!Number.isFinite(ms)) throw new PlushError(`The time of a reading is a number of milliseconds by the clock of the toy, and not ${String(ms)}.`);
     if (values?.length !== this.channels)
       throw new PlushError(`A reading of this toy has ${this.channels} values, one for each channel, and not ${values?.length ?? 0}.`);
     const to = new Int32Array(this._c.memory.buffer, this._values, this.channels);
     for (let i = 0; i < to.length; i++) {
-      const value = Math.round(values[i]);
+      const value = Math.round(values[i] ?? NaN);
       to[i] = Number.isNaN(value) ? NO_READING : Math.min(Math.max(value, NO_READING), 2 ** 31 - 1);
     }
     return this._values;
@@ -245,17 +245,17 @@ export class Toy {
   /**
    * Take one reading in.
    *
-   * @param {ArrayLike<number>} values whole steps of each channel; NaN for a sensor that gave none
+   * @param {ArrayLike<number>} values whole steps of each channel; NaN or null for a sensor that gave none
    * @param {number} ms when it was measured, by the clock of the toy
    * @returns {number} how many answers fell due
    */
   push(values, ms) {
-    return this._c.plush_push(this._toy, ms, this._reading(values));
+    return this._c.plush_push(this._toy, ms, this._reading(values, ms));
   }
 
   /** @param {ArrayLike<number>} values a reading at rest @param {number} ms @returns {boolean} whether it was taken */
   prime(values, ms) {
-    return this._c.plush_prime(this._toy, ms, this._reading(values)) !== 0;
+    return this._c.plush_prime(this._toy, ms, this._reading(values, ms)) !== 0;
   }
 
   /** @returns {Answer} */
