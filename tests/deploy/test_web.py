@@ -47,11 +47,16 @@ said.wasm = [];
 for (const wasm of modules) said.wasm.push(await open(bytes(images[0]), wasm).then(() => "taken", (e) => e.name + e.message));
 const rows = [];
 toy.onAnswer = (a) => rows.push([a.ms, a.sample, a.gesture, a.confidence * 32768, a.known, toy.probabilities().length]);
+toy.onEvent = () => toy.swap(bytes(other));
+said.uncaught = [];
+process.on("uncaughtException", (e) => said.uncaught.push(e.message));
 for (const [n, frame] of frames.entries()) {
   toy.push(frame.slice(1), frame[0]);
   if (n % 50 === 0) said.swapping = images.slice(1).map((image) => refused(() => toy.swap(bytes(image))));
 }
 said.before = rows.splice(0);
+toy.onEvent = null;
+await new Promise(setImmediate);
 const memory = toy.bytes;
 for (let n = 0; n < 40; n++) toy.swap(bytes(n % 2 ? images[0] : other));
 toy.swap(bytes(other));
@@ -119,6 +124,9 @@ def test_the_library_in_javascript(in_node: None, tmp_path: Path) -> None:
         assert len(expected) > 20 and expected.shape[1] == HEAD + 2 * said[name][0][5]
     refusals = [*said["opening"], *said["wasm"], *said["swapping"], *said["patches"], *said["reading"], said["nothing"]]
     assert all(re.fullmatch(r"[A-Z][^\n]{20,}\.", words) for words in refusals), refusals
+    assert set(said["uncaught"]) == {
+        "onAnswer and onEvent cannot change the toy that calls them: do it when push() is over."
+    }
     assert said["grown"] < 1 << 16 and said["events"] and said["counts"]["restarts"] == 0
     assert said["sensitivity"] == 127 and said["waiting"] == "waiting" and said["wrapped"] == ["first", "warming"]
 

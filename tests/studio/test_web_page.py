@@ -102,7 +102,9 @@ def pages(look: Callable[..., Look], tmp_path: Path) -> Iterator[Callable[..., O
         model = integer_model(bundle)
         image = model.to_bytes()
         file = tmp_path / "index.html"
-        content = web_files(bundle, facts_of(model, bundle, image), image, module(calibrate=bool(bundle.layout.self_calibration)))
+        content = web_files(
+            bundle, facts_of(model, bundle, image), image, module(calibrate=bool(bundle.layout.self_calibration))
+        )
         file.write_bytes(next(text for name, text in content.items() if name == PAGE))
         looking = look(own=True, **how)
         looking.context.set_offline(True)
@@ -402,6 +404,34 @@ def test_a_bluetooth_toy_with_older_firmware_is_read_until_it_goes_away(pages: C
     assert opened.page.evaluate("() => plushPage.run.parser.clock") == 10 * (n - 1)
     opened.page.evaluate("() => switchOff()")
     opened.until("message", "The toy went away (disconnected).")
+
+
+def test_a_button_pressed_twice_opens_one_port_and_the_last_file_chosen_is_played(
+    pages: Callable[..., Opened],
+) -> None:
+    opened = pages()
+    page = opened.page
+    page.evaluate("""() => {
+      window.begun = [];
+      addEventListener('plushsense', ({ detail }) => begun.push(detail));
+      for (const _ of '12') document.getElementById('serial').click();
+    }""")
+    opened.until("message", "Reading the toy.")
+    page.evaluate(
+        """(text) => {
+      for (const name of ['a.txt', 'b.txt']) {
+        const field = document.getElementById('file'), of = new DataTransfer();
+        of.items.add(new File([text], name));
+        field.files = of.files;
+        field.dispatchEvent(new Event('change'));
+      }
+    }""",
+        _bytes(_PLUSH, _stream(_PLUSH, 0.3)).decode(),
+    )
+    opened.until("message", "“b.txt” is over.")
+    assert page.evaluate("() => begun.map((own) => own.over)") == [True] * 3
+    opened.until("state", "Not started")
+    assert page.is_enabled("#serial")
 
 
 def test_each_sentence_of_the_page_has_a_translation_and_is_used() -> None:

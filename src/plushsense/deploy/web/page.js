@@ -223,8 +223,8 @@ const ring = { s: new Float64Array(KEPT), y: channels.map(() => new Float64Array
 
 /** Begin a run; `source` has: close() and, for a file, its name. */
 async function begin(source) {
-  await stop();
   const toy = await open(image, await module);
+  while (run && !run.over) await stop(); // another may have begun meanwhile
   const own = { source, toy, parser: new LineParser(true), reactor: new Reactor(), recent: [], follows: false, s: 0, ms: null, frames: 0, at: performance.now(), quiet: false, spans: [], log: [], eyes: "off", sound: "", until: 0 };
   toy.onEvent = (event) => change(own, event);
   run = own;
@@ -317,10 +317,10 @@ async function fromSerial() {
   const port = await navigator.serial.requestPort();
   await port.open({ baudRate: 115200, bufferSize: 1 << 20 }); // some minutes, should the page not get to read
   await port.setSignals?.({ dataTerminalReady: true, requestToSend: true }).catch(() => {}); // as pyserial does
-  let reader, why = "";
+  let reader, why = "", broken = null;
   const own = await begin({ close: async () => { await reader?.cancel().catch(() => {}); await port.close(); } });
-  for (let more = true; more && port.readable && !own.over; ) {
-    reader = port.readable.getReader();
+  for (let more = true; more && port.readable && port.readable !== broken && !own.over; ) {
+    reader = (broken = port.readable).getReader();
     try {
       for (let got; !(got = await reader.read()).done; ) feed(own, got.value);
       more = false;
@@ -343,7 +343,7 @@ async function fromBluetooth() {
   const own = await begin({ close: () => device.gatt.disconnect() });
   device.addEventListener("gattserverdisconnected", () => own.over || gone(own, "disconnected"), { once: true });
   tx.addEventListener("characteristicvaluechanged", ({ target: { value } }) => feed(own, new Uint8Array(value.buffer, value.byteOffset, value.byteLength)));
-  await tx.startNotifications();
+  await tx.startNotifications().catch((cause) => gone(own, cause.message));
 }
 
 /** Play a file at the pace of the toy's clock: devices/base.Pacer. */
@@ -370,12 +370,15 @@ async function fromFile(chosen) {
   play();
 }
 
-const attempt = (connect) => async () => {
+const attempt = (connect) => async ({ target }) => {
+  target.disabled = true; // until the source is closed: a second press must not open it twice
   try {
     await connect();
   } catch (cause) {
     const sentence = cause instanceof PlushError ? "This browser cannot run the model: {why}" : "The toy could not be connected ({why}). Close other programs that use it, and try again.";
     say("message", t(cause.name === "NotFoundError" ? "No toy was chosen." : sentence, { why: cause.message }));
+  } finally {
+    target.disabled = false;
   }
 };
 
