@@ -6,6 +6,7 @@ Each thing is compared with the Python that defines it, on the same bytes.
 from __future__ import annotations
 
 import base64
+import csv
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ import pytest
 
 from plushsense.core.gestures import AFFECTS, gesture_set_names, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
-from plushsense.core.recorder_csv import read_recording, read_stream
+from plushsense.core.recorder_csv import read_recording, read_stream, recording_filename
 from plushsense.deploy.code import IMAGE, facts_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.deploy.wasm import WEB, module
@@ -432,6 +433,36 @@ def test_a_button_pressed_twice_opens_one_port_and_the_last_file_chosen_is_playe
     assert page.evaluate("() => begun.map((own) => own.over)") == [True] * 3
     opened.until("state", "Not started")
     assert page.is_enabled("#serial")
+
+
+def test_any_label_is_shown_in_a_phone_s_width_saved_and_recorded(pages: Callable[..., Opened], tmp_path: Path) -> None:
+    labels = ["At rest; no, none", '</script><b>"' + 70 * "ž" + "🧸", " .. "]
+    known = load_gestures("plush-18").gestures[:3]
+    gestures = replace(
+        load_gestures("plush-18"), gestures=tuple(replace(g, label=n) for g, n in zip(known, labels, strict=True))
+    )
+    layout = load_layout("phone-6")
+    opened = pages(bundle_of(layout, gestures=gestures, window=60), size=PHONE)
+    page = opened.page
+    assert page.locator("#bars li").count() == 3
+    opened.connect()
+    page.click("summary")
+    page.evaluate("(label) => plushPage.run.log.push(['', '', 'named', 1, label, '', '', ''])", labels[1])
+    with page.expect_download() as kept:
+        page.click("#log")
+    rows = list(csv.reader(Path(kept.value.path()).read_text("utf-8").splitlines(), delimiter=";"))
+    assert [len(row) for row in rows] == [8, 8] and rows[1][4] == labels[1]
+    lines = _bytes(layout, [Frame(0, 10 * n, (n,) * 6) for n in range(30)])
+    for label in labels:
+        page.select_option("#gesture", label)
+        page.click("#record")
+        opened.send(b"\n" + lines)
+        with page.expect_download() as kept:
+            page.click("#record")
+        kept.value.save_as(tmp_path / (name := kept.value.suggested_filename))
+        assert name.startswith(recording_filename(label, 0, 0).removesuffix("0_0.csv"))
+        assert len(read_recording(tmp_path / name, layout).frames) == len(lines.splitlines())
+    assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
 
 
 def test_each_sentence_of_the_page_has_a_translation_and_is_used() -> None:

@@ -391,9 +391,11 @@ function save(name, lines) {
   setTimeout(() => URL.revokeObjectURL(a.href), 1000);
 }
 
+const quoted = (cell) => (/[;"\n]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell);
+
 /** A row as the recorder writes it: core/recorder_csv.format_rows. */
 function row(ms, values, host) {
-  const clocks = { host_ms: host, device_ms: ms, delay_ms: rows.ms === undefined ? 0 : ms - rows.ms, label: rows.label };
+  const clocks = { host_ms: host, device_ms: ms, delay_ms: rows.ms === undefined ? 0 : ms - rows.ms, label: rows.label.replace(/[;,]/g, "_") };
   rows.ms = ms;
   return layout.csv.columns.map((key) => {
     if (key in clocks) return clocks[key];
@@ -406,7 +408,7 @@ function record() {
   if (!rows && $("simulated").checked) return say("message", t("Simulated data are not recorded here, as the file could not say so: use plushsense record."));
   if (!rows) rows = Object.assign([], { label: $("gesture").value });
   else {
-    const name = rows.label.replace(/[\\/:*?"<>|()\x00-\x1f]/g, "_");
+    const name = rows.label.replace(/[\\/:*?"<>|()\x00-\x1f]/g, "_").replace(/^[ .]+|[ .]+$/g, "") || "_"; // recording_filename
     if (rows.length) save(`${name}_${Date.now()}_${rows.length}.csv`, [layout.csv.header.join(layout.csv.separator), ...rows]);
     rows = null;
   }
@@ -590,7 +592,7 @@ $("stop").addEventListener("click", () => stop());
 $("simulated").addEventListener("change", redraw);
 $("record").addEventListener("click", record);
 $("log").addEventListener("click", () => save(`plushsense-${$("mark").hidden ? "" : "simulated-"}${new Date().toISOString().slice(0, 19).replace(/:/g, "")}.csv`,
-  [["time", "t_s", "what", "number", "gesture", "affect", "source", "reaction"], ...run.log].map((cells) => cells.join(";"))));
+  [["time", "t_s", "what", "number", "gesture", "affect", "source", "reaction"], ...run.log].map((cells) => cells.map(quoted).join(";"))));
 for (const node of document.querySelectorAll("[data-language]")) node.addEventListener("click", () => speakLanguage(node.dataset.language));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 addEventListener("resize", draw);
