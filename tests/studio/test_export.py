@@ -15,6 +15,7 @@ import pytest
 
 import plushsense as ps
 from plushsense.core.errors import BadInput, ConfigError
+from plushsense.deploy.wasm import module
 from plushsense.studio.app.guard import path_in, zip_of
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.workspace import EXPORTS, Workspace, folder_digest
@@ -48,12 +49,14 @@ def test_the_task_writes_what_the_library_writes(
 ) -> None:
     # Without compilers and emulators the export stands, and says what would count.
     monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
+    module.cache_clear()
     place, bundle = little.new(EXPORTS, "one"), str(little.bundles()[0])
     result, reports = run_task(TASKS["export"], bundle=bundle, place=str(place), also=[], dataset="")
     ps.export(bundle, tmp_path / "two")
     assert sums(place) == sums(tmp_path / "two")
     assert set(result["files"]) == set(sums(place))
-    assert [r["progress"]["stage"] for r in reports] == ["export", "profile"]
+    assert [r["progress"]["stage"] for r in reports if "progress" in r] == ["export", "profile"]
+    assert "web/index.html" in str(next(r for r in reports if "progress" not in r))
     found = ExportFacts.of(place)
     assert exports_of(little) == [place]
     facts = found.facts

@@ -12,6 +12,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.crossval import context_of
 from plushsense.windows.clock import resample
 from plushsense.windows.cut import (
     WindowSpec,
@@ -70,6 +71,18 @@ def test_loops_repeat_from_the_start_and_are_never_padded(dataset: Dataset) -> N
     ben = next(r for r in dataset.used if r.subject == "ben" and r.gesture == "Wave")
     (looped,) = from_recording(resample(dataset.read(ben), ACCEL), dataset, 250, 50)
     assert (looped.context, looped.begin) == ("loop", 0)
+
+
+def test_rest_holds_the_first_reading_before_a_short_recording(dataset: Dataset) -> None:
+    spec, gestures = WindowSpec(context="rest"), dataset.gestures.subset(["Wave"])
+    w, looped = cut_windows(dataset, spec, gestures), cut_windows(dataset, replace(spec, context="loop"), gestures)
+    short = w.integers[w.subject == "ben"][0]
+    assert short[0].tolist() == [0] * 150 + list(range(100)) and np.all(short[1] == 1)
+    turned = cut_windows(dataset.with_inputs(ACCEL.for_vectors()), spec, gestures)
+    assert np.all(turned.integers[turned.subject == "ben"][0, 4] == 16), "gravity is that of the whole past"
+    assert w.context.tolist() == ["rest" if c == "loop" else c for c in looped.context]
+    assert np.all(w.window_rows == -1) and context_of(w) == "rest"
+    assert whole_gestures({"context": "rest"}).context == "rest"
 
 
 def test_stream_context_is_what_came_before(dataset: Dataset) -> None:

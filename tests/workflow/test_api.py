@@ -280,10 +280,10 @@ def test_a_file_under_two_labels_and_a_long_window_are_named(
     assert usual_s == 2.325
     assert of("14d1", 1.0) == ""
     window = of("14d1", 2.5)
-    assert "window 2.5 s" in window and "begin before" in window and "try window_s = 2.3 in [windows]" in window
+    assert "window 2.5 s" in window and "begin before" in window and "try --window-s 2.3" in window
     assert "--arch" not in window and "repeat their gesture" in of("14d1", 2.5, "loop")
     kernels = of("14d1_39d2_41d4", 1.0, padding="mirror")
-    assert "kernels 2.5 s, window 1 s" in kernels and "try --arch " in kernels and "window_s" not in kernels
+    assert "kernels 2.5 s, window 1 s" in kernels and "try --arch " in kernels and "--window-s" not in kernels
     assert of(kernels.rpartition(" ")[2], 1.0) == ""
     # Whoever follows an advice gets no other one.
     assert of("14d1", 2.3) == of("14d1_19d2_19d4", 2.3) == of("14d1_19d2_19d4", 1.3) == ""

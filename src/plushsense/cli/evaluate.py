@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, settings
+from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, say_advice, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.files import write_file
 from plushsense.core.sentences import plural
@@ -52,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
     content["report"] = str(write_report(out / PAGE, dataset, [out]))
     say(f"written: {out}")
     emit(args, content, lines(content))
+    say_advice(args.dataset)
     return 0
 
 

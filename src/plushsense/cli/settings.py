@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
+from plushsense.cli.output import say
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
@@ -54,11 +55,19 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
 
     return resolve(
         args.config,
-        windows=options(args, "context"),
+        windows=options(args, "context", "window_s"),
         model=options(args, "arch", "filters", "padding", "norm", "pool_s"),
         training=options(args, "preset", "epochs", "batch", "seed", "device", "scaling", "weight_decay"),
         evaluation={"classes": args.classes, "seed": args.seed, **evaluation},
     )
+
+
+def say_advice(dataset: str) -> None:
+    """Say on standard error, in one line, what would change the scores and is not used."""
+    from plushsense.workflow.datasets import unused_advice
+
+    if advice := unused_advice(dataset, ProgressReporter("checking")):
+        say(f"not used: {'; '.join(advice)}; an evaluation with it says what it brings")
 
 
 def report_epochs(title: str = "training") -> EpochProgress:

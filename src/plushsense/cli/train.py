@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, warn
-from plushsense.cli.settings import report_epochs, settings
+from plushsense.cli.settings import report_epochs, say_advice, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 
@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
             *decided(done.bundle.decision),
         ],
     )
+    say_advice(args.dataset)
     return 0
 
 

@@ -352,9 +352,9 @@ class _FoldWork:
 
 
 def context_of(windows: WindowSet) -> str:
-    """Return the first of the contexts "anywhere", "stream", "rows", "loop" and "inside" that any window has."""
+    """Return the first of "anywhere", "stream", "rest", "rows", "loop" and "inside" that is the context of a window."""
     present = set(np.unique(windows.context).tolist())
-    return next((kind for kind in ("anywhere", "stream", "rows", "loop") if kind in present), "inside")
+    return next((kind for kind in ("anywhere", "stream", "rest", "rows", "loop") if kind in present), "inside")
 
 
 def windows_fingerprint(windows: WindowSet) -> str:

@@ -375,7 +375,7 @@ class _Scorer:
         return VoteResult(_plain(figures), len(ids))
 
     def by_context(self, mask: Mask) -> dict[str, PartResult]:
-        kinds = ("stream", "inside", "loop", "rows")
+        kinds = ("stream", "inside", "rest", "loop", "rows")
         masks = {kind: mask & (self._all.context == kind) for kind in kinds}
         return {kind: self.part(selected) for kind, selected in masks.items() if selected.any()}
 

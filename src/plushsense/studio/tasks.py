@@ -186,7 +186,7 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
                 person=spec["person"],
                 guess_layout=not adding,
                 # What a single source proves may not fit the others.
-                adopt_proposals=len(sources) == 1 and not adding,
+                adopt_proposals=None if len(sources) == 1 and not adding else False,
                 readmit=readmit,
                 limits=UNPACKED,
                 progress=reporter.count,
@@ -197,7 +197,7 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             refused.append((source.name, refusal))
     if done:
         if len(sources) > 1:
-            done.append(replace(propose(done[-1], adopting=True), warnings=(), rejected=()))
+            done.append(replace(propose(done[-1], adopting=None), warnings=(), rejected=()))
         return _contents(dest, done, [{"file": file, "reason": cause.message} for file, cause in refused])
     first = refused[0][1]
     needs = first.message.values.get("needs")

@@ -6,6 +6,7 @@ one gives a single window, whose remaining samples depend on the ``context``:
 - ``stream``: they are the samples before the recording in the session's stream. If there is no stream, or it has too
   few samples, the recording is looped, and the window is marked as such.
 - ``loop``: the recording is repeated from its start, as in the paper (never zero-padded).
+- ``rest``: its first reading stands before it, as if the toy had been still.
 - ``rows``: as with ``loop``, but the rows of the recording are taken as even samples, whatever their times, as the
   authors' scripts do. No recording is left out for its length.
 
@@ -32,8 +33,8 @@ from plushsense.windows.clock import Segment, whole_recording
 from plushsense.windows.features import InputUnits, network_inputs
 from plushsense.windows.sessions import SessionReader
 
-ROWS = "rows"
-CONTEXTS = ("stream", "loop", ROWS)
+REST, ROWS = "rest", "rows"
+CONTEXTS = ("stream", REST, "loop", ROWS)
 ANYWHERE = "anywhere"
 TRAIN_CONTEXTS = (*CONTEXTS, ANYWHERE)
 
@@ -46,10 +47,10 @@ class WindowSpec:
         window_s: length of the windows (above 0 to 60).
         step_s: time from the start of a window to that of the next one in the same recording (above 0 to 60).
         context: where the samples come from that a recording shorter than a window lacks. ``stream``: from the
-            session before the recording; ``loop``: the recording is repeated; ``rows``: the same, and its rows are
-            taken as even samples whatever their times, as by the authors' scripts; ``anywhere``: for live use,
-            windows are cut all along the sessions, also while nothing happens (one of `TRAIN_CONTEXTS`; default: by
-            the preset).
+            session before the recording; ``rest``: its first reading, as if the toy had been still; ``loop``: the
+            recording is repeated; ``rows``: the same, and its rows are taken as even samples whatever their times, as
+            by the authors' scripts; ``anywhere``: for live use, windows are cut all along the sessions, also while
+            nothing happens (one of `TRAIN_CONTEXTS`; default: by the preset).
         span_s: Not in a file: it follows from the network. It lengthens windows for networks that need more samples.
         longest_factor: recordings longer than this many times the median of their gesture are left out; 0: none is
             (0 or from 1).
@@ -90,8 +91,8 @@ class WindowSet:
     ``x`` (N, F, T): inputs of the network, unscaled, in the ``units`` of the layout; ``integers`` (N, F, T): as the toy
     computes them, in steps; ``y`` (N,): class index; ``recording`` (N,): index into ``recording_ids``;
     ``subject`` (N,): code of the person, "none" if nobody; ``context`` (N,): "inside" (wholly in its recording),
-    "stream" (begins before it in the stream), "loop", "rows" or "anywhere"; ``stream`` (N,): id of the stream of the
-    recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
+    "stream" (begins before it in the stream), "rest", "loop", "rows" or "anywhere"; ``stream`` (N,): id of the stream
+    of the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
     recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes of one
     vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
     ``self_calibration``: "causal" if sensors calibrate themselves (`plushsense.windows.sessions`), else "".
@@ -159,15 +160,21 @@ class WindowCut:
     begin: int = 0
 
 
-def from_recording(segments: list[Segment], dataset: Dataset, window: int, step: int) -> list[WindowCut]:
-    """Cut full windows from every segment; if none is long enough, loop the longest segment."""
+def from_recording(
+    segments: list[Segment], dataset: Dataset, window: int, step: int, rest: bool = False
+) -> list[WindowCut]:
+    """Cut full windows from every segment; if none is long enough, loop the longest, or with ``rest`` begin at rest."""
     cuts = []
     for segment in segments:
         if len(segment) >= window:
             x = network_inputs(segment.data, dataset.layout)
             begins = range(0, len(x) - window + 1, step)
             cuts += [WindowCut(x[s : s + window], "inside", (-1, -1), s) for s in begins]
-    if not cuts and segments:
+    if not cuts and segments and rest:
+        data = max(segments, key=len).data
+        whole = np.concatenate([np.repeat(data[:1], window - len(data), axis=0), data])
+        cuts.append(WindowCut(network_inputs(whole, dataset.layout), REST, (-1, -1)))
+    elif not cuts and segments:
         x = network_inputs(max(segments, key=len).data, dataset.layout)
         repeated = np.tile(x, (-(-window // len(x)), 1))[:window]
         cuts.append(WindowCut(repeated, "loop", (-1, -1)))
@@ -228,7 +235,8 @@ class RecordingCutter:
             cuts = from_recording(segments, self._dataset, self.reach, self._step)
             cuts = [replace(cut, context=ROWS) for cut in cuts]
         if not cuts and self._spec.context != ROWS:
-            cuts = from_recording(self._sessions.recording(recording), self._dataset, self.reach, self._step)
+            segments = self._sessions.recording(recording)
+            cuts = from_recording(segments, self._dataset, self.reach, self._step, self._spec.context == REST)
         if not cuts:
             still = recording.id in self._sessions.standing
             template = "{recording}: its clock stands still" if still else "{recording}: no valid sample"
@@ -289,7 +297,7 @@ def cut_windows(
     if spec.context == ROWS and dataset.layout.self_calibration:
         raise ConfigError(
             f"The layout '{dataset.layout.name}' calibrates its sensors in the course of a session, which the context "
-            f"'{ROWS}' does not know: use the context loop or stream."
+            f"'{ROWS}' does not know: use the context stream, rest or loop."
         )
     of_choice = [] if gestures is not None else [g.label for g in dataset.gestures.gestures if g.free_choice]
     if gestures is None:

@@ -303,6 +303,15 @@ def windows_for(
     for line in cut.left_out:
         warn(Message("left out: {line}", line=line))
     warn_of_far_readings(cut, warn)
+    if spec.context == "stream" and 2 * (looped := int((cut.context == "loop").sum())) > len(cut):
+        warn(
+            Message(
+                "{n} of {of} windows repeat their gesture, as no stream tells what came before it: --context rest puts "
+                "its first reading there, with which networks read real streams better",
+                n=looped,
+                of=len(cut),
+            )
+        )
     # Cells that nothing touches are constant without a fault.
     if not any(c.is_discrete for c in dataset.layout.channels) and (note := constant_windows(cut)) is not None:
         warn(note)
@@ -410,7 +419,7 @@ def warn_of_long_windows(
     if window_s > max(usual_s, shorter_s):
         then = replace(arch, window=layout.samples(shorter_s), pool=None)
         still = f" (a decision then reads {then.span / layout.rate_hz:.1f} s)" if then.span > then.window else ""
-        advice.append(f"window_s = {shorter_s:g} in [windows] of a --config file, or in a grid{still}")
+        advice.append(f"--window-s {shorter_s:g}{still}")
     if not advice:
         return
     looped = spec.context in ("loop", ROWS)

@@ -101,7 +101,9 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
     found = tomllib.loads(guessed.toml)
     assert found["paths"] == ["{subject}/*.csv"], "the next recording may have another name"
     assert found["exclude"] == ["people.csv"]
-    assert found["layout"]["channels"] == [{"name": "force", "unit": "", "kind": "sensor", "step": 0.01}]
+    wide = 10485.76  # 2^20 steps, with which the channel may calibrate itself
+    force = {"name": "force", "unit": "", "kind": "sensor", "step": 0.01, "valid_min": -wide, "valid_max": wide}
+    assert found["layout"]["channels"] == [force]
     assert found["layout"]["rate_hz"] == 100.0
     assert guessed.doubts[0] == "files that do not end in '.csv' are left out: 1"
     assert [doubt.partition(":")[0] for doubt in guessed.doubts[1:]] == [

@@ -13,6 +13,7 @@ import pytest
 from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.sentences import Message
+from plushsense.dataset.importing.guessing import guess_pattern
 from plushsense.dataset.importing.importers import ADOPTED, import_recordings
 from plushsense.dataset.importing.proposals import Sensor, find_sensors
 from plushsense.dataset.importing.sources import readable_layouts
@@ -323,3 +324,45 @@ def test_numbers_without_a_header_are_no_recording_of_the_recorder_unless_a_colu
     (folder / "Wave_1700000000000_40.csv").write_text("".join(f"{i};1;2;3;4\n" for i in range(40)))
     with pytest.raises(ConfigError, match="--layout is needed"):
         import_recordings(tmp_path / "R", tmp_path / "DS")
+
+
+def textile(folder: Path, apart: float, gestures: int = 3) -> Path:
+    """Write touches of a capacitance and a resistance, whose rest differs by ``apart`` touches between six people."""
+    rng = np.random.default_rng(0)
+    folder.mkdir(parents=True)
+    lines = ["subject,time_ms,capacitance,resistance,count,label"]
+    for person in range(6):
+        rest = np.array([300.0, 40_000.0]) + apart * np.array([20, 4000]) * (person - 2.5)
+        for take in range(4 * gestures):
+            touch = np.sin(np.arange(120) * np.pi / 120 * (1 + take % gestures)) ** 2 * (np.arange(120) > 30)
+            values = rest + np.outer(touch, [20, -4000]) + rng.normal(0, [0.2, 40], (120, 2))
+            begin = 10**12 + 10**6 * person + 10_000 * take
+            lines += [
+                f"P{person},{begin + 20 * i},{c:.2f},{r:.0f},{i % 7},g{take % gestures}"
+                for i, (c, r) in enumerate(values)
+            ]
+    (folder / "t.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize(("apart", "gestures", "proposed"), [(2, 3, True), (0.2, 3, False), (2, 1, False)])
+def test_channels_whose_rest_differs_between_people_are_proposed_to_calibrate_themselves(
+    tmp_path: Path, cli: Callable[..., Any], apart: float, gestures: int, proposed: bool
+) -> None:
+    source, pattern = textile(tmp_path / "R", apart, gestures), tmp_path / "p.toml"
+    guess_pattern(source).write(pattern)
+    ran = cli("import", source, tmp_path / "DS", "--pattern", pattern)
+    advice = 'give a layout with self_calibration = ["capacitance", "resistance"], or import anew with --adopt'
+    assert (advice in ran.err) == proposed and not open_dataset(tmp_path / "DS").layout.self_calibration
+    # A layout without the valid range that the key needs gets it.
+    guessed = guess_pattern(source).pattern.known_layout() or ACCEL
+    wide = tuple(replace(c, valid_min=-1e6, valid_max=1e6) for c in guessed.channels)
+    for given in (guessed.channels, wide):
+        place = tmp_path / str(given is wide)
+        layout = replace(guessed, channels=given)
+        done = import_recordings(source, place, pattern=pattern, layout=layout, adopt_proposals=True)
+        found = open_dataset(place).layout
+        assert found.self_calibration == (("capacitance", "resistance") if proposed else ())
+        assert all(p.adopted for p in done.proposals if p.key != "window_s")
+        limits = guessed.channels[0] if proposed else given[0]
+        assert found.channels[0].valid_max == -found.channels[0].valid_min == limits.valid_max

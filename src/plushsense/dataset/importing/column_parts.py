@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.gestures import alike_labels, plain_label
+from plushsense.core.layouts import MOST_CALIBRATED, MOST_CALIBRATED_OTHER
 from plushsense.core.sentences import Message, join_names
 from plushsense.dataset.importing.columns import (
     CODE_NAMES,
@@ -410,13 +411,18 @@ def _measured(column: SampledColumn, guess: PatternDraft) -> dict[str, Any]:
     kind = _RATE if _ANGULAR.search(name) else "acceleration" if _ACCELERATION.search(name) else "sensor"
     if set(values.tolist()) <= {0.0, 1.0} and not digits and kind == "sensor":
         return _channel(name, "binary", valid_min=0, valid_max=1)
-    # Whole numbers of steps have to fit 32 bits, and the square of a magnitude of three axes 64.
-    while digits and np.abs(values).max() * 10**digits > _MOST_STEPS:
+    largest = float(np.abs(values).max())
+    # A magnitude needs a range; twice the largest value is a guess at that of the sensor.
+    limit = float(2 ** int(np.ceil(np.log2(max(2 * largest, 1.0)))))
+    # Whole numbers of steps have to fit 32 bits; those of a vector a self-calibration, and their squares 64 bits.
+    highest, most = (largest, _MOST_STEPS) if kind == "sensor" else (limit, MOST_CALIBRATED)
+    while digits and highest * 10**digits > most:
         digits -= 1
     more: dict[str, Any] = {"step": float(f"1e-{digits}")} if digits else {}
-    if kind != "sensor":
-        # A magnitude needs a range; twice the largest value is a guess at that of the sensor.
-        limit = float(2 ** int(np.ceil(np.log2(max(2 * np.abs(values).max(), 1.0)))))
+    if kind == "sensor":
+        # The widest range with which the channel may calibrate itself.
+        limit = MOST_CALIBRATED_OTHER * more.get("step", 1.0)
+    if 2 * largest <= limit:
         more |= {"valid_min": -limit, "valid_max": limit}
     return _channel(name, kind, **more)
 
@@ -445,7 +451,7 @@ def _vectors(guess: PatternDraft) -> None:
 
 def _ranges(guess: PatternDraft) -> None:
     """Give the axes of one vector the same range, the largest of theirs, and the same step."""
-    axes = {c["name"]: c for c in guess.channels if "valid_min" in c and c["kind"] != "binary"}
+    axes = {c["name"]: c for c in guess.channels if c["kind"] in ("acceleration", _RATE)}
     alone = [[name] for name in axes if not any(name in vector for vector in guess.vectors)]
     for names in [*guess.vectors, *alone]:
         limit = max(axes[name]["valid_max"] for name in names)

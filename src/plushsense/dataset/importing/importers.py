@@ -24,7 +24,14 @@ from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.build import add_to_dataset, create_dataset, label_notes
 from plushsense.dataset.importing.counters import counters_note
 from plushsense.dataset.importing.pattern import ImportPattern, read_pattern
-from plushsense.dataset.importing.proposals import SELF_CALIBRATION, Proposal, adopt, find_sensors, propose_settings
+from plushsense.dataset.importing.proposals import (
+    SELF_CALIBRATION,
+    WINDOW,
+    Proposal,
+    adopt,
+    find_sensors,
+    propose_settings,
+)
 from plushsense.dataset.importing.results import FileReason, ImportPreview, ImportResult, PreviewRow, group_flags
 from plushsense.dataset.importing.scanning import scan_source
 from plushsense.dataset.importing.sources import LEFT_OUT, ScanSpec, SourceFile, SourceScan, folder_name, read_mapping
@@ -91,7 +98,8 @@ class ImportSettings(ScanSettings, total=False):
         simulated: whether the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
         people: the path of a people's table, see `dataset.store.read_people`.
         adopt_proposals: whether the layout of a new data set takes what its recordings prove (see `propose_settings`):
-            rate, gap, offsets, units, valid ranges, self-calibration. Everything else is only reported.
+            rate, gap, offsets, units, valid ranges, self-calibration (default). False: nothing; True: also what is only
+            probable, such as the self-calibration of channels whose rest differs between sessions.
         readmit: whether to take in people who were removed from the home that the data set lies in.
     """
 
@@ -271,9 +279,7 @@ def _create(
         source=scan.shape,
         simulated=scan.simulated or settings.get("simulated", False),
     )
-    return propose(
-        create_dataset(source, dest, scan, head, people, progress), settings.get("adopt_proposals") is not False
-    )
+    return propose(create_dataset(source, dest, scan, head, people, progress), settings.get("adopt_proposals"))
 
 
 def _add(source: Path, dest: Path, spec: ScanSpec, settings: ImportSettings, progress: Progress | None) -> ImportResult:
@@ -325,10 +331,11 @@ def _check_layout(dest: Path, own: Layout, given: Layout | None, named: bool) ->
 _OF_ADDED = (SELF_CALIBRATION, "valid_min", "valid_max")
 
 
-def propose(result: ImportResult, adopting: bool = False, added: bool = False) -> ImportResult:
-    """Measure the data set of an import; return its result with what fits it better, and if ``adopting`` adopt that.
+def propose(result: ImportResult, adopting: bool | None = False, added: bool = False) -> ImportResult:
+    """Measure the data set of an import; return its result with what fits it better, and adopt that.
 
-    A layout adopts only what is proven, and a note says what that was. Warn of channels that are no readings.
+    A layout adopts nothing (``adopting`` False), what is proven (None) or all (True), and a note says what that was.
+    Warn of channels that are no readings.
 
     If recordings were ``added``, only failed readings and sensors that differ are proposed on: the layout has been
     chosen.
@@ -338,8 +345,9 @@ def propose(result: ImportResult, adopting: bool = False, added: bool = False) -
     notes = counters_note(dataset.layout, [dataset.read(recording) for recording in some])
     sensors = find_sensors(dataset)
     found = [p for p in propose_settings(dataset, sensors) if not added or p.key in _OF_ADDED]
-    layout = adopt(dataset.layout, found) if adopting else dataset.layout
-    proposals = [replace(p, adopted=adopting and _is_adopted(p, layout)) for p in found]
+    layout = dataset.layout if adopting is False else adopt(dataset.layout, found, doubtful=adopting is True)
+    taken = [adopting is not False and (p.proven or adopting is True) and _is_adopted(p, layout) for p in found]
+    proposals = [replace(p, adopted=adopted) for p, adopted in zip(found, taken, strict=True)]
     if adopted := [p for p in proposals if p.adopted]:
         notes.append(_note_of_adopted(adopted))
     if layout != dataset.layout:
@@ -352,9 +360,10 @@ def propose(result: ImportResult, adopting: bool = False, added: bool = False) -
 
 
 def _is_adopted(proposal: Proposal, layout: Layout) -> bool:
-    """Return whether ``layout``, which adopted what it could, has the proposed setting."""
-    calibrated = proposal.key != SELF_CALIBRATION or set(proposal.value) <= set(layout.self_calibration)
-    return proposal.proven and calibrated
+    """Return whether ``layout``, which adopted what it could, has the proposed setting; no layout has a window."""
+    if proposal.key == SELF_CALIBRATION:
+        return set(proposal.value) <= set(layout.self_calibration)
+    return proposal.key != WINDOW
 
 
 ADOPTED = "adopted in the layout (--no-adopt keeps it as given): {listed}"

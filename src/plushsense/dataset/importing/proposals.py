@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import LayoutError
-from plushsense.core.layouts import ACCELERATION, MEASURED, Layout
+from plushsense.core.layouts import ACCELERATION, MEASURED, MOST_CALIBRATED_OTHER, Layout
 from plushsense.core.sentences import join_names
 from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.quality.outliers import find_failed_readings
@@ -53,8 +53,12 @@ _UNITS = {
 }
 _UNIT_SHARE = 0.05
 _NAMED = 8
+# A channel drifts if a quarter of the sessions, of three or more, rest further from the usual rest than touch leads.
+_FAR = 0.25
+_LEAST_SESSIONS = 3
+_TOUCH = 0.9  # quantile of the distances from rest
 
-SELF_CALIBRATION = "self_calibration"
+SELF_CALIBRATION, WINDOW = "self_calibration", "window_s"
 
 Floats = NDArray[np.float64]
 Sphere = tuple[Floats, float]
@@ -174,9 +178,11 @@ class Proposal:
     @property
     def advice(self) -> str:
         """What to do, or what was done if the layout adopted the proposal."""
-        if self.key == "window_s":
-            return f"try  [windows] {self.setting}  in a --config file"
-        return f"adopted {self.setting}" if self.adopted else f"give a layout with {self.setting}"
+        if self.key == WINDOW:
+            return f"try  --window-s {self.value:g}  of train and evaluate"
+        if self.adopted:
+            return f"adopted {self.setting}"
+        return f"give a layout with {self.setting}, or import anew with --adopt"
 
     def to_json(self) -> dict[str, object]:
         """Return plain values for JSON; ``groups`` only if there are any."""
@@ -209,23 +215,24 @@ def propose_settings(dataset: Dataset, sensors: Sequence[Sensor] | None = None) 
         *_rate_and_gap(dataset),
         *_zeros(dataset.layout, sensors),
         *_units(dataset.layout, sensors),
+        *_drifts(dataset),
         *_valid_ranges(dataset),
         *_window(dataset),
     ]
 
 
-def adopt(layout: Layout, proposals: Sequence[Proposal]) -> Layout:
-    """Return the layout with the proposals that are proven.
+def adopt(layout: Layout, proposals: Sequence[Proposal], doubtful: bool = False) -> Layout:
+    """Return the layout with the proposals that are proven, or with the ``doubtful`` ones as well.
 
     Axes whose valid range is too wide for a self-calibration stay without.
     """
-    values = {p.key: p.value for p in proposals if p.proven}
-    of_channels = [(key, values[key]) for key in MEASURED if key in values]
+    taken = [p for p in proposals if p.proven or doubtful]
+    of_channels = [(p.key, p.value) for p in taken if p.key in MEASURED]
     channels = tuple(
         replace(c, **{key: named[c.name] for key, named in of_channels if c.name in named}) for c in layout.channels
     )
-    same = {key: values[key] for key in ("rate_hz", "gap_ms") if key in values}
-    calibrated = (*layout.self_calibration, *values.get(SELF_CALIBRATION, ()))
+    same = {p.key: p.value for p in taken if p.key in ("rate_hz", "gap_ms")}
+    calibrated = (*layout.self_calibration, *(name for p in taken if p.key == SELF_CALIBRATION for name in p.value))
     adopted = replace(layout, channels=channels, **same)
     try:
         return replace(adopted, self_calibration=calibrated)
@@ -272,22 +279,23 @@ def find_sensors(dataset: Dataset) -> list[Sensor]:
 def _sensors_of(dataset: Dataset, vector: tuple[str, ...]) -> Iterator[Sensor]:
     layout = dataset.layout
     axes = [layout.index(name) for name in vector]
-    sessions, blocks, owner = _blocks(dataset, axes)
+    sessions, measured, owner = _blocks(dataset, axes, zeroing_limit(layout) is not None)
     if not sessions:
         return
-    stillest = np.zeros(len(blocks), dtype=np.bool_)
+    means, noise = measured[:, 0], measured[:, 1].max(axis=1)
+    stillest = np.zeros(len(means), dtype=np.bool_)
     for k in range(len(sessions)):
         mine = np.flatnonzero(owner == k)
-        stillest[mine[blocks[mine, 3] <= np.quantile(blocks[mine, 3], _STILLEST)]] = True
-    points, at = blocks[stillest, :3], owner[stillest]
+        stillest[mine[noise[mine] <= np.quantile(noise[mine], _STILLEST)]] = True
+    points, at = means[stillest], owner[stillest]
     own = [_sphere(points[at == k]) for k in range(len(sessions))]
     for k, fit in enumerate(own):
         # Blocks of a session that is never still are not on a sphere.
-        if fit is not None and np.median(blocks[stillest, 3][at == k]) > _ON_SPHERE * fit[1]:
+        if fit is not None and np.median(noise[stillest][at == k]) > _ON_SPHERE * fit[1]:
             own[k] = None
     people = {subject: [k for k, session in enumerate(sessions) if session[0] == subject] for subject, _ in sessions}
     pooled = [_sphere(points[np.isin(at, mine)]) for mine in people.values() if len(mine) > 1]
-    everything = _sphere(blocks[blocks[:, 3] <= np.quantile(blocks[:, 3], _STILLEST), :3])
+    everything = _sphere(means[noise <= np.quantile(noise, _STILLEST)])
     enough = np.bincount(at, minlength=len(sessions)) >= _LEAST_POINTS
     groups: list[Sphere] = []
     left = enough.copy()
@@ -320,14 +328,14 @@ def _sensors_of(dataset: Dataset, vector: tuple[str, ...]) -> Iterator[Sensor]:
 
 def length_at_rest(dataset: Dataset, axes: list[int]) -> float | None:
     """Return the median length of an acceleration in the stillest blocks, in steps; None if they show no gravity."""
-    _, blocks, _ = _blocks(dataset, axes)
+    _, blocks, _ = _blocks(dataset, axes, zeroing_limit(dataset.layout) is not None)
     if len(blocks) < _LEAST_BLOCKS:
         return None
-    means = blocks[:, :3] - dataset.layout.zero_int[axes]
-    still = blocks[:, 3] <= np.quantile(blocks[:, 3], _STILLEST)
+    means, noise = blocks[:, 0] - dataset.layout.zero_int[axes], blocks[:, 1].max(axis=1)
+    still = noise <= np.quantile(noise, _STILLEST)
     length = float(np.median(np.linalg.norm(means[still], axis=1)))
-    moving = float(np.sqrt((means**2).sum(axis=1).mean() + 3 * (blocks[:, 3] ** 2).mean()))
-    return length if length > max(_GRAVITY * moving, 3 * float(np.median(blocks[still, 3]))) else None
+    moving = float(np.sqrt((means**2).sum(axis=1).mean() + 3 * (noise**2).mean()))
+    return length if length > max(_GRAVITY * moving, 3 * float(np.median(noise[still]))) else None
 
 
 def _errors(fit: Sphere, points: Floats, owner: NDArray[np.int64], sessions: int) -> Floats:
@@ -401,15 +409,69 @@ def _valid_ranges(dataset: Dataset) -> Iterator[Proposal]:
                 yield Proposal(key, limits, reason, proven=proven)
 
 
-def _blocks(dataset: Dataset, axes: list[int]) -> tuple[list[tuple[str, str]], Floats, NDArray[np.int64]]:
-    """Cut some recordings of each session into blocks of 0.3 s.
+def _drifts(dataset: Dataset) -> Iterator[Proposal]:
+    """Propose self-calibration of channels, other than accelerations, whose rest differs between sessions.
 
-    Returns:
-        The person and session of each session with blocks; the mean of each axis and the largest standard deviation of
-        each block (n, 4), in steps of the layout; and the index of its session (n,).
+    Scaled over the training people, rest of such a session reads like touch of another. Sessions of one gesture tell
+    nothing: what differs may be the gesture.
     """
     layout = dataset.layout
-    replaced = zeroing_limit(layout) is not None
+    named = {axis: vector for vector in layout.vectors for axis in vector}
+    may_drift = [
+        c.name
+        for c in layout.channels
+        if c.kind != ACCELERATION and not c.is_discrete and c.name not in layout.self_calibration
+    ]
+    gestures: dict[tuple[str, str], set[str]] = {}
+    for r in dataset.used:
+        gestures.setdefault((r.subject, r.session), set()).add(r.gesture)
+    if not may_drift or sum(len(made) > 1 for made in gestures.values()) < _LEAST_SESSIONS:
+        return
+    sessions, blocks, owner = _blocks(dataset, [layout.index(name) for name in may_drift], replaced=False)
+    fits = (2 * np.abs(blocks[:, 0]).max(axis=0, initial=0) <= MOST_CALIBRATED_OTHER).tolist()
+    mine = [blocks[owner == k] for k, session in enumerate(sessions) if len(gestures[session]) > 1]
+    drifting = list[str]()
+    for axes in dict.fromkeys(named.get(name, (name,)) for name in may_drift):
+        at = [may_drift.index(name) for name in axes]
+        if all(fits[i] for i in at) and _differs([part[:, :, at] for part in mine]):
+            drifting += axes
+    if not drifting:
+        return
+    least = f"a quarter of {len(mine)} sessions rest further from the others than touch leads away from rest"
+    reason = f"{join_names(drifting, most=_NAMED)}: {least}"
+    for key, sign in (("valid_min", -1), ("valid_max", 1)):
+        limits = {c.name: sign * MOST_CALIBRATED_OTHER * c.step for c in layout.channels if c.name in drifting}
+        given = {c.name: getattr(c, key) for c in layout.channels}
+        if narrower := {name: v for name, v in limits.items() if abs(given[name]) > abs(v)}:
+            yield Proposal(key, narrower, reason, proven=False)
+    yield Proposal(SELF_CALIBRATION, drifting, reason, proven=False)
+
+
+def _differs(sessions: Sequence[Floats]) -> bool:
+    """Return whether rest differs between sessions, each blocks (n, 2, A) of one sensor, by more than touch."""
+    rests, touches = list[Floats](), list[float]()
+    for blocks in sessions:
+        noise = np.square(blocks[:, 1]).sum(axis=1)
+        rests.append(np.median(blocks[noise <= np.quantile(noise, _STILLEST), 0], axis=0))
+        distance = np.square(blocks[:, 0] - rests[-1]).sum(axis=1) + noise
+        touches.append(float(np.sqrt(np.quantile(distance, _TOUCH))))
+    touch = float(np.median(touches))
+    away = np.linalg.norm(np.array(rests) - np.median(rests, axis=0), axis=1)
+    return len(rests) >= _LEAST_SESSIONS and 0.0 < touch < float(np.quantile(away, 1 - _FAR))
+
+
+def _blocks(
+    dataset: Dataset, axes: list[int], replaced: bool
+) -> tuple[list[tuple[str, str]], Floats, NDArray[np.int64]]:
+    """Cut some recordings of each session into blocks of 0.3 s.
+
+    With ``replaced``, blocks in which an axis stays at 0 are left out: the authors' recorder replaces values by it.
+
+    Returns:
+        The person and session of each session with blocks; the mean and the standard deviation of each axis in each
+        block (n, 2, A), in steps of the layout; and the index of its session (n,).
+    """
+    layout = dataset.layout
     by_session: dict[tuple[str, str], list[RecordingInfo]] = {}
     for recording in dataset.used:
         by_session.setdefault((recording.subject, recording.session), []).append(recording)
@@ -421,16 +483,15 @@ def _blocks(dataset: Dataset, axes: list[int]) -> tuple[list[tuple[str, str]], F
             values = np.clip(dataset.read(recording).values, layout.valid_min_int, layout.valid_max_int)[:, axes]
             rows = max(3, round(_BLOCK_S * (recording.rate_hz or layout.rate_hz)))
             n = len(values) // rows
-            cut = values[: n * rows].reshape(n, rows, 3).astype(np.float64)
+            cut = values[: n * rows].reshape(n, rows, len(axes)).astype(np.float64)
             if replaced:
-                # An axis that stays at 0 probably had values that the authors' recorder replaced.
                 cut = cut[(cut != 0).any(axis=1).all(axis=1)]
-            blocks.append(np.concatenate([cut.mean(axis=1), cut.std(axis=1).max(axis=1)[:, None]], axis=1))
+            blocks.append(np.stack([cut.mean(axis=1), cut.std(axis=1)], axis=1))
         joined = np.concatenate(blocks)
         if len(joined):
             found[session] = joined
     owner = np.repeat(np.arange(len(found)), [len(blocks) for blocks in found.values()])
-    return list(found), np.concatenate([*found.values()]) if found else np.zeros((0, 4)), owner
+    return list(found), np.concatenate([*found.values()]) if found else np.zeros((0, 2, len(axes))), owner
 
 
 def _sphere(points: Floats) -> Sphere | None:
@@ -463,7 +524,7 @@ def _window(dataset: Dataset) -> Iterator[Proposal]:
     seconds = median_gesture_s(dataset)
     if seconds is not None and seconds < DEFAULT_WINDOW_S:
         yield Proposal(
-            "window_s",
+            WINDOW,
             fitting_window_s(seconds),
             f"half of the recordings last less than {seconds:.1f} s, so windows of {DEFAULT_WINDOW_S} s, the default, "
             "mostly begin before their gesture",

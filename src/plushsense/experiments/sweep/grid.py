@@ -85,8 +85,9 @@ class GridSpec:
         preset: training settings to begin with (one of `PRESETS`).
         padding: what a network reads before the start of a window, as in a configuration file (one of `PADDINGS`).
         norm: normalisation after each layer (one of `NORMS`).
-        context: what fills the windows of short recordings: ``stream``: the session before; ``loop``: the recording
-            again; ``rows``: the same, with its rows as even samples, as by the authors' scripts (one of `CONTEXTS`).
+        context: what fills the windows of short recordings: ``stream``: the session before; ``rest``: its first
+            reading, held; ``loop``: the recording again; ``rows``: the same, with its rows as even samples, as by the
+            authors' scripts (one of `CONTEXTS`).
         classes: ``all``, ``shared``, labels as a list or joined by commas, or merged gestures, as in a configuration
             file.
         window_s: length of the windows (above 0 to 60).

@@ -48,6 +48,7 @@ _SPLITS: Texts = {
 
 _CONTEXTS: Texts = {
     "stream": "real past",
+    "rest": "rest before the gesture",
     "loop": "repeated gesture",
     "rows": "repeated rows",
     "anywhere": "for live use",

@@ -97,6 +97,7 @@ _CONTEXTS: Texts = {
     "default": "as in the schedule",
     "anywhere": "anywhere: for live use, also learns idleness",
     "stream": "stream: the real past in the session",
+    "rest": "rest: as if nobody had touched the toy before",
     "loop": "loop: the gesture repeated",
     "rows": "rows: the same, as the authors' scripts cut it",
 }
