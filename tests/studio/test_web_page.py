@@ -541,7 +541,7 @@ def test_the_page_of_the_documentation_reads_a_toy(look: Callable[..., Look], tr
     page.wait_for_function("() => connect.onclick")
     page.click("#connect")
     page.wait_for_function("() => portOptions()")
-    data = base64.b64encode(_bytes(_PLUSH, _stream(_PLUSH, 16))).decode()
+    data = base64.b64encode(b"noise " * 15 + b"\n" + _bytes(_PLUSH, _stream(_PLUSH, 16))).decode()
     page.evaluate("(data) => sendBytes(data)", data)
     page.wait_for_function("() => state.textContent === 'begun: negative'")
 
