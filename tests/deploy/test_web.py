@@ -42,14 +42,22 @@ const said = {};
 const toy = await open(bytes(images[0]));
 said.opening = [];
 for (const image of images.slice(1)) said.opening.push(await open(bytes(image)).then(() => "taken", (e) => e.message));
-said.wasm = await open(bytes(images[0]), bytes(images[1])).then(() => "taken", (e) => e.message);
+const modules = [bytes(images[1]), new WebAssembly.Module(new Uint8Array([0, 97, 115, 109, 1, 0, 0, 0]))];
+said.wasm = [];
+const named = (e) => `${e.name}: ${e.message}`;
+for (const wasm of modules) said.wasm.push(await open(bytes(images[0]), wasm).then(() => "taken", named));
 const rows = [];
 toy.onAnswer = (a) => rows.push([a.ms, a.sample, a.gesture, a.confidence * 32768, a.known, toy.probabilities().length]);
+toy.onEvent = () => toy.swap(bytes(other));
+said.uncaught = [];
+process.on("uncaughtException", (e) => said.uncaught.push(e.message));
 for (const [n, frame] of frames.entries()) {
   toy.push(frame.slice(1), frame[0]);
   if (n % 50 === 0) said.swapping = images.slice(1).map((image) => refused(() => toy.swap(bytes(image))));
 }
 said.before = rows.splice(0);
+toy.onEvent = null;
+await new Promise(setImmediate);
 const memory = toy.bytes;
 for (let n = 0; n < 40; n++) toy.swap(bytes(n % 2 ? images[0] : other));
 toy.swap(bytes(other));
@@ -59,12 +67,13 @@ said.after = rows.splice(0);
 said.events = toy.events().every((e) => ["begun", "named", "ended"].includes(e.what));
 said.counts = toy.counts();
 said.patches = [images[1], images[0]].map((image) => refused(() => toy.patch(bytes(image))));
-said.reading = [refused(() => toy.push([1], 5)), refused(() => toy.push(null, 5))];
+const wrong = [[[1], 5], [null, 5], [[1, 2, 3]], [[1, 2, 3], NaN], [[1, 2, 3], "5"]];
+said.reading = wrong.map((given) => refused(() => toy.push(...given)));
 said.nothing = refused(() => toy.swap("text"));
 toy.sensitivity = 300;
 said.sensitivity = toy.sensitivity;
 toy.restart();
-toy.push([NaN, 1, 2], 2 ** 32 - 10);
+toy.push([null, 1, 2], 2 ** 32 - 10);
 said.waiting = toy.counts().reading;
 toy.push([5, 1, 2], 2 ** 32);
 toy.push([5, 1, 2], 2 ** 32 + 10);
@@ -114,8 +123,11 @@ def test_the_library_in_javascript(in_node: None, tmp_path: Path) -> None:
         expected = expected[expected[:, 0] == ANSWER]
         assert [row[:5] for row in said[name]] == expected[:, at].tolist(), name
         assert len(expected) > 20 and expected.shape[1] == HEAD + 2 * said[name][0][5]
-    refusals = [*said["opening"], said["wasm"], *said["swapping"], *said["patches"], *said["reading"], said["nothing"]]
+    refusals = [*said["opening"], *said["wasm"], *said["swapping"], *said["patches"], *said["reading"], said["nothing"]]
     assert all(re.fullmatch(r"[A-Z][^\n]{20,}\.", words) for words in refusals), refusals
+    assert set(said["uncaught"]) == {
+        "onAnswer and onEvent cannot change the toy that calls them: do it when push() is over."
+    }
     assert said["grown"] < 1 << 16 and said["events"] and said["counts"]["restarts"] == 0
     assert said["sensitivity"] == 127 and said["waiting"] == "waiting" and said["wrapped"] == ["first", "warming"]
 

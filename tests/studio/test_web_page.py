@@ -6,9 +6,10 @@ Each thing is compared with the Python that defines it, on the same bytes.
 from __future__ import annotations
 
 import base64
+import csv
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import pytest
 
 from plushsense.core.gestures import AFFECTS, gesture_set_names, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
-from plushsense.core.recorder_csv import read_recording, read_stream
+from plushsense.core.recorder_csv import read_recording, read_stream, recording_filename
 from plushsense.deploy.code import IMAGE, facts_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.deploy.wasm import WEB, module
@@ -31,6 +32,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import IntegerClassifier
 from plushsense.runtime.image import IntegerModel
 from plushsense.studio.app.words import Words
+from plushsense.windows.clock import LONG_PAUSE_MS
 from support.browsing import KEPT, PHONE, Look, Studio, axe, english, keep_picture, marked
 from support.exports import bundle_of, exported
 from support.requirements import LONG
@@ -101,7 +103,9 @@ def pages(look: Callable[..., Look], tmp_path: Path) -> Iterator[Callable[..., O
         model = integer_model(bundle)
         image = model.to_bytes()
         file = tmp_path / "index.html"
-        content = web_files(bundle, facts_of(model, bundle, image), image, module(calibrate=False))
+        content = web_files(
+            bundle, facts_of(model, bundle, image), image, module(calibrate=bool(bundle.layout.self_calibration))
+        )
         file.write_bytes(next(text for name, text in content.items() if name == PAGE))
         looking = look(own=True, **how)
         looking.context.set_offline(True)
@@ -187,6 +191,36 @@ def test_the_page_decides_as_live_int8_on_the_same_bytes(pages: Callable[..., Op
     assert got["bad"] == parser.counters.malformed == 3
     opened.until("counts", f"{n:d}")
     assert opened.page.evaluate("() => plushPage.run.toy.counts().restarts") == 1
+
+
+def test_after_a_reboot_sensors_calibrate_themselves_anew_as_in_live(
+    pages: Callable[..., Opened], tmp_path: Path
+) -> None:
+    """By the browser's clock, and by that of a recording, of which one frame has an impossible time."""
+    layout = replace(_PLUSH, self_calibration=_PLUSH.names)
+    opened = pages(bundle_of(layout, window=60))
+    page, start = opened.page, 1_700_000_000_000
+    parts = [_stream(_PLUSH, 6, person) for person in (3, 4)]
+    hosts = (start, start + LONG_PAUSE_MS + 10_000)
+    frames = [Frame(host, f.device_ms, f.values) for host, part in zip(hosts, parts, strict=True) for f in part]
+    frames[900] = frames[900]._replace(device_ms=10**9)
+    expected = [step[1:] for step in _answers(IntegerClassifier(opened.model), frames)[0]]
+    assert expected[-1] != _answers(IntegerClassifier(opened.model), [f._replace(host_ms=0) for f in frames])[0][-1][1:]
+    opened.connect()
+    for host, part in ((hosts[0], frames[:600]), (hosts[1], frames[600:])):
+        page.clock.set_fixed_time(host)
+        opened.send(b"\n" * (part[0] is frames[0]) + _bytes(_PLUSH, part))
+    tracking = "() => answers.splice(0).filter((a) => a[1] === 'tracking').map((a) => a.slice(1))"
+    assert page.evaluate(tracking) == expected
+    page.click("#stop")
+    page.clock.pause_at(hosts[1] + 1)
+    lines = [_PLUSH.csv.separator.join(map(str, [*f.values, f.host_ms, f.device_ms])) for f in frames]
+    text = "\n".join(["; ".join([*_PLUSH.names, "host_ms", "device_ms"]), *lines, ""])
+    page.set_input_files("#file", {"name": "fulldatastream.csv", "mimeType": "text/csv", "buffer": text.encode()})
+    opened.until("message", "Playing")
+    page.clock.run_for(20_000)
+    opened.until("message", "is over.")
+    assert page.evaluate(tracking) == expected
 
 
 @pytest.mark.parametrize("layout", ["plush-15", "plush-14", "phone-6"])
@@ -373,6 +407,64 @@ def test_a_bluetooth_toy_with_older_firmware_is_read_until_it_goes_away(pages: C
     opened.until("message", "The toy went away (disconnected).")
 
 
+def test_a_button_pressed_twice_opens_one_port_and_the_last_file_chosen_is_played(
+    pages: Callable[..., Opened],
+) -> None:
+    opened = pages()
+    page = opened.page
+    page.evaluate("""() => {
+      window.begun = [];
+      addEventListener('plushsense', ({ detail }) => begun.push(detail));
+      for (const _ of '12') document.getElementById('serial').click();
+    }""")
+    opened.until("message", "Reading the toy.")
+    page.evaluate(
+        """(text) => {
+      for (const name of ['a.txt', 'b.txt']) {
+        const field = document.getElementById('file'), of = new DataTransfer();
+        of.items.add(new File([text], name));
+        field.files = of.files;
+        field.dispatchEvent(new Event('change'));
+      }
+    }""",
+        _bytes(_PLUSH, _stream(_PLUSH, 0.3)).decode(),
+    )
+    opened.until("message", "“b.txt” is over.")
+    assert page.evaluate("() => begun.map((own) => own.over)") == [True] * 3
+    opened.until("state", "Not started")
+    assert page.is_enabled("#serial")
+
+
+def test_any_label_is_shown_in_a_phone_s_width_saved_and_recorded(pages: Callable[..., Opened], tmp_path: Path) -> None:
+    labels = ["At rest; no, none", '</script><b>"' + 70 * "ž" + "🧸", " .. "]
+    known = load_gestures("plush-18").gestures[:3]
+    gestures = replace(
+        load_gestures("plush-18"), gestures=tuple(replace(g, label=n) for g, n in zip(known, labels, strict=True))
+    )
+    layout = load_layout("phone-6")
+    opened = pages(bundle_of(layout, gestures=gestures, window=60), size=PHONE)
+    page = opened.page
+    assert page.locator("#bars li").count() == 3
+    opened.connect()
+    page.click("summary")
+    page.evaluate("(label) => plushPage.run.log.push(['', '', 'named', 1, label, '', '', ''])", labels[1])
+    with page.expect_download() as kept:
+        page.click("#log")
+    rows = list(csv.reader(Path(kept.value.path()).read_text("utf-8").splitlines(), delimiter=";"))
+    assert [len(row) for row in rows] == [8, 8] and rows[1][4] == labels[1]
+    lines = _bytes(layout, [Frame(0, 10 * n, (n,) * 6) for n in range(30)])
+    for label in labels:
+        page.select_option("#gesture", label)
+        page.click("#record")
+        opened.send(b"\n" + lines)
+        with page.expect_download() as kept:
+            page.click("#record")
+        kept.value.save_as(tmp_path / (name := kept.value.suggested_filename))
+        assert name.startswith(recording_filename(label, 0, 0).removesuffix("0_0.csv"))
+        assert len(read_recording(tmp_path / name, layout).frames) == len(lines.splitlines())
+    assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+
+
 def test_each_sentence_of_the_page_has_a_translation_and_is_used() -> None:
     script, template = ((WEB / name).read_text("utf-8") for name in ("page.js", "page.html.j2"))
     table, rest = script.split("const LATVIAN = {")[1].split("\n};", 1)
@@ -449,7 +541,7 @@ def test_the_page_of_the_documentation_reads_a_toy(look: Callable[..., Look], tr
     page.wait_for_function("() => connect.onclick")
     page.click("#connect")
     page.wait_for_function("() => portOptions()")
-    data = base64.b64encode(_bytes(_PLUSH, _stream(_PLUSH, 16))).decode()
+    data = base64.b64encode(b"noise " * 15 + b"\n" + _bytes(_PLUSH, _stream(_PLUSH, 16))).decode()
     page.evaluate("(data) => sendBytes(data)", data)
     page.wait_for_function("() => state.textContent === 'begun: negative'")
 

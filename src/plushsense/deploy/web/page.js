@@ -194,7 +194,7 @@ function readFile(bytes, name) {
   clock ??= delays?.map((delay) => (ms += delay)) ?? host;
   if (!rows.length || !clock) return null;
   const at = channels.map((c) => of.keys.indexOf(c.name));
-  return { malformed, frames: rows.map((row, n) => ({ ms: clock[n], values: at.map((i, c) => toEven(row[i] / channels[c].step)) })) };
+  return { malformed, frames: rows.map((row, n) => ({ ms: clock[n], host: host?.[n], values: at.map((i, c) => toEven(row[i] / channels[c].step)) })) };
 }
 
 // Reactions: live/reactions.Reactor, for the rules of the built-in profiles (an affect that has begun) -------------------
@@ -215,6 +215,7 @@ class Reactor {
 
 // A run: the frames of one source through the model ----------------------------------------------------------------------
 const SILENT_MS = 750, SHOWN_S = 10, MOST_MB = 64, MOST_ROWS = 20000, KEPT = Math.ceil(1.2 * SHOWN_S * layout.rate_hz);
+const STALE_FRAMES = 256, LONG_PAUSE_MS = 600000; // windows/clock
 const bytesOf = (id) => Uint8Array.from(atob($(id).textContent.trim()), (c) => c.charCodeAt(0));
 const module = WebAssembly.compile(bytesOf("module")), image = bytesOf("image");
 let run = null, rows = null; // rows: of the recording of frames that goes on
@@ -222,9 +223,9 @@ const ring = { s: new Float64Array(KEPT), y: channels.map(() => new Float64Array
 
 /** Begin a run; `source` has: close() and, for a file, its name. */
 async function begin(source) {
-  await stop();
   const toy = await open(image, await module);
-  const own = { source, toy, parser: new LineParser(true), reactor: new Reactor(), s: 0, ms: null, frames: 0, at: performance.now(), quiet: false, spans: [], log: [], eyes: "off", sound: "", until: 0 };
+  while (run && !run.over) await stop(); // another may have begun meanwhile
+  const own = { source, toy, parser: new LineParser(true), reactor: new Reactor(), recent: [], follows: false, s: 0, ms: null, frames: 0, at: performance.now(), quiet: false, spans: [], log: [], eyes: "off", sound: "", until: 0 };
   toy.onEvent = (event) => change(own, event);
   run = own;
   ring.n = 0;
@@ -250,16 +251,30 @@ async function stop(sentence = "") {
   await Promise.resolve(old.source.close?.()).catch(() => {});
 }
 
+/** Rules 1 and 4 of windows/clock: with the first frame after a reboot, sensors that calibrate themselves begin anew. */
+function noticeReboot(own, ms, host) {
+  const { recent } = own, step = ms - (recent.at(-1)?.ms ?? ms), gap = layout.gap_ms;
+  if (step < 0 && step >= -gap) return;
+  const ordered = step >= 0 && step <= gap, leftOut = own.follows && !ordered;
+  own.follows = !leftOut;
+  if (leftOut) return;
+  const paused = host - recent[0]?.host;
+  if (!ordered && paused >= LONG_PAUSE_MS && 2 * (ms - recent[0].ms) < paused) own.toy.recalibrate();
+  if (recent.push({ ms, host }) > STALE_FRAMES) recent.shift();
+}
+
 function take(own, frames) {
   if (own.over || !frames.length) return;
-  for (const { ms, values } of frames) {
+  const now = Date.now();
+  for (const { ms, values, host = now } of frames) {
     const step = ms - (own.ms ?? ms);
     [own.s, own.ms] = [own.s + (step < 0 ? period : step) / 1000, ms];
+    noticeReboot(own, ms, host);
     own.toy.push(values, ms);
     ring.s[ring.n % KEPT] = own.s;
     for (let i = 0; i < values.length; i++) ring.y[i][ring.n % KEPT] = values[i];
     ring.n++;
-    rows?.push(row(ms, values));
+    rows?.push(row(ms, values, host));
   }
   Object.assign(own, { frames: own.frames + frames.length, at: performance.now(), quiet: false });
   draw();
@@ -302,10 +317,10 @@ async function fromSerial() {
   const port = await navigator.serial.requestPort();
   await port.open({ baudRate: 115200, bufferSize: 1 << 20 }); // some minutes, should the page not get to read
   await port.setSignals?.({ dataTerminalReady: true, requestToSend: true }).catch(() => {}); // as pyserial does
-  let reader, why = "";
+  let reader, why = "", broken = null;
   const own = await begin({ close: async () => { await reader?.cancel().catch(() => {}); await port.close(); } });
-  for (let more = true; more && port.readable && !own.over; ) {
-    reader = port.readable.getReader();
+  for (let more = true; more && port.readable && port.readable !== broken && !own.over; ) {
+    reader = (broken = port.readable).getReader();
     try {
       for (let got; !(got = await reader.read()).done; ) feed(own, got.value);
       more = false;
@@ -328,7 +343,7 @@ async function fromBluetooth() {
   const own = await begin({ close: () => device.gatt.disconnect() });
   device.addEventListener("gattserverdisconnected", () => own.over || gone(own, "disconnected"), { once: true });
   tx.addEventListener("characteristicvaluechanged", ({ target: { value } }) => feed(own, new Uint8Array(value.buffer, value.byteOffset, value.byteLength)));
-  await tx.startNotifications();
+  await tx.startNotifications().catch((cause) => gone(own, cause.message));
 }
 
 /** Play a file at the pace of the toy's clock: devices/base.Pacer. */
@@ -355,12 +370,15 @@ async function fromFile(chosen) {
   play();
 }
 
-const attempt = (connect) => async () => {
+const attempt = (connect) => async ({ target }) => {
+  target.disabled = true; // until the source is closed: a second press must not open it twice
   try {
     await connect();
   } catch (cause) {
     const sentence = cause instanceof PlushError ? "This browser cannot run the model: {why}" : "The toy could not be connected ({why}). Close other programs that use it, and try again.";
     say("message", t(cause.name === "NotFoundError" ? "No toy was chosen." : sentence, { why: cause.message }));
+  } finally {
+    target.disabled = false;
   }
 };
 
@@ -373,9 +391,11 @@ function save(name, lines) {
   setTimeout(() => URL.revokeObjectURL(a.href), 1000);
 }
 
+const quoted = (cell) => (/[;"\n]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell);
+
 /** A row as the recorder writes it: core/recorder_csv.format_rows. */
-function row(ms, values) {
-  const clocks = { host_ms: Date.now(), device_ms: ms, delay_ms: rows.ms === undefined ? 0 : ms - rows.ms, label: rows.label };
+function row(ms, values, host) {
+  const clocks = { host_ms: host, device_ms: ms, delay_ms: rows.ms === undefined ? 0 : ms - rows.ms, label: rows.label.replace(/[;,]/g, "_") };
   rows.ms = ms;
   return layout.csv.columns.map((key) => {
     if (key in clocks) return clocks[key];
@@ -388,7 +408,7 @@ function record() {
   if (!rows && $("simulated").checked) return say("message", t("Simulated data are not recorded here, as the file could not say so: use plushsense record."));
   if (!rows) rows = Object.assign([], { label: $("gesture").value });
   else {
-    const name = rows.label.replace(/[\\/:*?"<>|()\x00-\x1f]/g, "_");
+    const name = rows.label.replace(/[\\/:*?"<>|()\x00-\x1f]/g, "_").replace(/^[ .]+|[ .]+$/g, "") || "_"; // recording_filename
     if (rows.length) save(`${name}_${Date.now()}_${rows.length}.csv`, [layout.csv.header.join(layout.csv.separator), ...rows]);
     rows = null;
   }
@@ -572,7 +592,7 @@ $("stop").addEventListener("click", () => stop());
 $("simulated").addEventListener("change", redraw);
 $("record").addEventListener("click", record);
 $("log").addEventListener("click", () => save(`plushsense-${$("mark").hidden ? "" : "simulated-"}${new Date().toISOString().slice(0, 19).replace(/:/g, "")}.csv`,
-  [["time", "t_s", "what", "number", "gesture", "affect", "source", "reaction"], ...run.log].map((cells) => cells.join(";"))));
+  [["time", "t_s", "what", "number", "gesture", "affect", "source", "reaction"], ...run.log].map((cells) => cells.map(quoted).join(";"))));
 for (const node of document.querySelectorAll("[data-language]")) node.addEventListener("click", () => speakLanguage(node.dataset.language));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 addEventListener("resize", draw);

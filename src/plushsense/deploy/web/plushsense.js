@@ -23,7 +23,8 @@
  *     recalibrate()            other sensors, or the toy was off for long: sensors that calibrate themselves begin anew
  *     swap(model), patch(bytes or null)   another image for the same channels; the last layer of one person
  *     sensitivity              -128 to 127, 0: as trained
- *     onAnswer, onEvent        called with each, while push(), prime() and others run
+ *     onAnswer, onEvent        called with each, while push(), prime() and others run, which they cannot call themselves;
+ *                              what they throw is reported as uncaught when the call is over, and the toy goes on
  *
  * A gap in the stamps needs no call: the toy is warming again by itself (counts().restarts). All times are milliseconds
  * of the toy's own clock, which wraps after 2^32. What cannot be done throws a PlushError with one sentence.
@@ -106,15 +107,14 @@ export class PlushError extends Error {
  * @returns {Promise<Toy>}
  */
 export async function open(model, wasm) {
-  let code;
+  let toy;
   try {
-    code = wasm instanceof WebAssembly.Module ? wasm : await WebAssembly.compile(wasm ?? (await besideThis()));
+    const code = wasm instanceof WebAssembly.Module ? wasm : await WebAssembly.compile(wasm ?? (await besideThis()));
+    const instance = await WebAssembly.instantiate(code, { plush: { told: (what) => toy._told(what) } });
+    toy = new Toy(instance.exports);
   } catch (cause) {
     throw new PlushError(`The WebAssembly module cannot be used (${cause.message}): check plushsense.wasm, and that the browser is of 2021 or later.`);
   }
-  let toy;
-  const instance = await WebAssembly.instantiate(code, { plush: { told: (what) => toy._told(what) } });
-  toy = new Toy(instance.exports);
   toy._begin(model);
   return toy;
 }
@@ -171,6 +171,7 @@ export class Toy {
 
   /** So many bytes of the module's memory, by a name; what was there is overwritten. */
   _room(name, bytes) {
+    this._settled();
     const room = this._rooms[name];
     if (room && room.bytes >= bytes) return room.at;
     const at = (this._end + 15) & ~15;
@@ -213,7 +214,18 @@ export class Toy {
     return Array.from(this._read(5 + 2 * this.names.length));
   }
 
+  /** An answer (0) or a change of an event, in the midst of a step, out of which no error must lead. */
   _told(what) {
+    this._telling = true;
+    try {
+      this._tell(what);
+    } catch (cause) {
+      queueMicrotask(() => { throw cause; });
+    }
+    this._telling = false;
+  }
+
+  _tell(what) {
     if (what === 0) return this.onAnswer?.(this.answer());
     this._c.plush_read_event(this._toy, this._numbers);
     const [kind, number, affect, gesture, source, since, ms] = this._read(7);
@@ -231,12 +243,18 @@ export class Toy {
     this.onEvent?.(event);
   }
 
-  _reading(values) {
+  _settled() {
+    if (this._telling) throw new PlushError("onAnswer and onEvent cannot change the toy that calls them: do it when push() is over.");
+  }
+
+  _reading(values, ms) {
+    this._settled();
+    if (!Number.isFinite(ms)) throw new PlushError(`The time of a reading is a number of milliseconds by the clock of the toy, and not ${String(ms)}.`);
     if (values?.length !== this.channels)
       throw new PlushError(`A reading of this toy has ${this.channels} values, one for each channel, and not ${values?.length ?? 0}.`);
     const to = new Int32Array(this._c.memory.buffer, this._values, this.channels);
     for (let i = 0; i < to.length; i++) {
-      const value = Math.round(values[i]);
+      const value = Math.round(values[i] ?? NaN);
       to[i] = Number.isNaN(value) ? NO_READING : Math.min(Math.max(value, NO_READING), 2 ** 31 - 1);
     }
     return this._values;
@@ -245,17 +263,17 @@ export class Toy {
   /**
    * Take one reading in.
    *
-   * @param {ArrayLike<number>} values whole steps of each channel; NaN for a sensor that gave none
+   * @param {ArrayLike<number>} values whole steps of each channel; NaN or null for a sensor that gave none
    * @param {number} ms when it was measured, by the clock of the toy
    * @returns {number} how many answers fell due
    */
   push(values, ms) {
-    return this._c.plush_push(this._toy, ms, this._reading(values));
+    return this._c.plush_push(this._toy, ms, this._reading(values, ms));
   }
 
   /** @param {ArrayLike<number>} values a reading at rest @param {number} ms @returns {boolean} whether it was taken */
   prime(values, ms) {
-    return this._c.plush_prime(this._toy, ms, this._reading(values)) !== 0;
+    return this._c.plush_prime(this._toy, ms, this._reading(values, ms)) !== 0;
   }
 
   /** @returns {Answer} */
@@ -316,10 +334,12 @@ export class Toy {
   }
 
   silence() {
+    this._settled();
     this._c.plush_silence(this._toy);
   }
 
   restart() {
+    this._settled();
     this._c.plush_restart(this._toy);
   }
 
