@@ -171,6 +171,9 @@ def test_a_learning_curve_stands_beside_the_evaluation(cli: Cli, dataset: Datase
     assert sentence in Path(ran.json["report"]).read_text(encoding="utf-8")
     shown = cli("evaluate", dataset.path, *SMALL, "--people", "2").out
     assert "people trained on" in shown and sentence in shown
+    # An evaluation of other settings in the same folder does not quote the curve of the first.
+    other = cli("evaluate", dataset.path, *SMALL, "--seed", "1", "--out", ran.json["out"], "--force", "--json")
+    assert sentence not in Path(other.json["report"]).read_text(encoding="utf-8")
     for wrong, split, why in (
         ("5", "leave-one-subject-out", "is trained on 4"),
         ("4", "leave-one-subject-out", "is trained on 4"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, say_advice, settings
 from plushsense.core.errors import ConfigError
-from plushsense.core.files import write_file
 from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
@@ -21,9 +19,9 @@ if TYPE_CHECKING:
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
     from plushsense.workflow.api import FoldsSpec, evaluate_run
-    from plushsense.workflow.learning import check_sizes, measure_curve
+    from plushsense.workflow.learning import check_sizes, measure_curve, save_curve
     from plushsense.workflow.preparation import prepare
-    from plushsense.workflow.reporting import LEARNING, PAGE, write_report
+    from plushsense.workflow.reporting import PAGE, write_report
 
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
     if args.save_windows:
@@ -47,8 +45,7 @@ def run(args: argparse.Namespace) -> int:
             warn("No learning curve: it needs two numbers of people to train on, and three people left out.")
         else:
             content["learning"] = curve.to_json()
-            with dataset.generation.writing():
-                write_file(out / LEARNING, json.dumps(curve.to_json()))
+            save_curve(curve, made, out)
     content["report"] = str(write_report(out / PAGE, dataset, [out]))
     say(f"written: {out}")
     emit(args, content, lines(content))

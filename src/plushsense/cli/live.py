@@ -13,7 +13,8 @@ from plushsense.cli.signals import interrupt_on_signals
 
 if TYPE_CHECKING:
     from plushsense.live.reactions import Reaction
-    from plushsense.runtime.classifier import Decision, GestureEvent, State
+    from plushsense.models.bundle import Bundle
+    from plushsense.runtime.classifier import Decision, GestureEvent, State, StreamReader
 
 STATES = {
     "warming": "collecting the first samples",
@@ -25,21 +26,15 @@ STATES = {
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.deploy.quantize import classifier_of
     from plushsense.devices.opening import open_device
     from plushsense.live.loop import run_live
     from plushsense.live.reactions import Reactor, load_reactions
     from plushsense.models.bundle import Bundle
     from plushsense.runtime.classifier import BothEngines
-    from plushsense.runtime.decisions import DecideSpec
 
     bundle = Bundle.load(args.model)
+    classifier = _classifier(args, bundle)
     reactor = Reactor(load_reactions(args.reactions, bundle.gestures)) if args.reactions else None
-    decide = DecideSpec.from_dict(bundle.decision)
-    if args.smoothing is not None:
-        decide = replace(decide, smoothing_s=args.smoothing)
-    classifier = classifier_of(bundle, decide, args.engine)
-    classifier.sensitivity = args.sensitivity
     with interrupt_on_signals(), open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
         say(
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
@@ -85,6 +80,19 @@ def run(args: argparse.Namespace) -> int:
             both = {"agreement": vars(classifier.agreement())} if isinstance(classifier, BothEngines) else {}
             say(json.dumps(live.summary().to_dict() | both))
     return 0
+
+
+def _classifier(args: argparse.Namespace, bundle: Bundle) -> StreamReader:
+    """Create the classifier of the chosen engine, with the options that change its decisions."""
+    from plushsense.deploy.quantize import classifier_of
+    from plushsense.runtime.decisions import DecideSpec
+
+    decide = DecideSpec.from_dict(bundle.decision)
+    if args.smoothing is not None:
+        decide = replace(decide, smoothing_s=args.smoothing)
+    classifier = classifier_of(bundle, decide, args.engine)
+    classifier.sensitivity = args.sensitivity
+    return classifier
 
 
 def format_update(decision: Decision, state_changed: bool, reactions: Sequence[Reaction] = ()) -> list[str]:

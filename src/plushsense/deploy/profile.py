@@ -522,22 +522,7 @@ def profile(
     arch = export.model.network.arch
     if not trust:
         export.require_unchanged()
-    counting = [name for name, target in TARGETS.items() if target.counts]
-    for name in targets:
-        check_known(name, [*counting, "host", WASM], "target to profile", ConfigError)
-    names = list(dict.fromkeys(targets)) or counting
-    missing = {name: lacks for name in names if (lacks := missing_tools(name))}
-    if targets:
-        for name in missing:
-            require(name)
-    installed = [name for name in names if name not in missing]
-    if not installed:
-        packages = " ".join(dict.fromkeys(p for lacks in missing.values() for p in lacks))
-        raise ToolError(
-            "No emulator to count on is installed here: install Debian's {packages} (or some of them), or give "
-            "--target host for sizes on this computer only.",
-            packages=packages,
-        )
+    installed, missing = _choose_targets(targets)
     costs, web = {}, None
     with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as work:
         code = export.code(Path(work) / "code")
@@ -554,6 +539,27 @@ def profile(
         if core.target in costs and (found := estimate(core, costs[core.target], arch, facts.step_ms))
     }
     return Profile(facts, arch, optimise, costs, estimates, missing, web)
+
+
+def _choose_targets(targets: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
+    """Return the targets to profile, and the Debian packages that the others lack; ``targets`` as in `profile`."""
+    counting = [name for name, target in TARGETS.items() if target.counts]
+    for name in targets:
+        check_known(name, [*counting, "host", WASM], "target to profile", ConfigError)
+    names = list(dict.fromkeys(targets)) or counting
+    missing = {name: lacks for name in names if (lacks := missing_tools(name))}
+    if targets:
+        for name in missing:
+            require(name)
+    installed = [name for name in names if name not in missing]
+    if not installed:
+        packages = " ".join(dict.fromkeys(p for lacks in missing.values() for p in lacks))
+        raise ToolError(
+            "No emulator to count on is installed here: install Debian's {packages} (or some of them), or give "
+            "--target host for sizes on this computer only.",
+            packages=packages,
+        )
+    return installed, missing
 
 
 def _web(export: Export, work: Path, image: Path) -> WebCost:

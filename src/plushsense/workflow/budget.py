@@ -8,7 +8,6 @@ folds are stored, so that an interrupted run can be resumed.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import PlushSenseError, python_warning
-from plushsense.core.files import free_path, write_file
+from plushsense.core.files import free_path
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.jobs.journal import job_id
@@ -30,10 +29,10 @@ from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import FoldsSpec, evaluate_run, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.estimate import preview_evaluation
-from plushsense.workflow.learning import LearningCurve, accuracies, learning_curve
+from plushsense.workflow.learning import LearningCurve, accuracies, learning_curve, save_curve
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import Run, Warn, count_people, prepare, refits, silent
-from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, journal_of, write_report
+from plushsense.workflow.reporting import PAGE, check_folder, journal_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
 _KNOWN_PEOPLE = "by-recording:5"
@@ -242,8 +241,7 @@ class _Making:
         folder = self._dataset.path / "evaluations" / run.name
         learning = self._evaluate(plan, run, folder, bundle, resumed=stored is not None)
         if learning is not None:
-            with self._dataset.generation.writing():
-                write_file(folder / LEARNING, json.dumps(learning.to_json()))
+            save_curve(learning, run, folder)
         report = write_report(folder / PAGE, self._dataset, [folder])
         self._journal.discard(self._key)
         cut = _cut(plan, learning, self._seconds, self._budget_s)

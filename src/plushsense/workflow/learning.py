@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
 from plushsense.core.errors import ConfigError
+from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.evaluation.crossval import EvaluationResult, fold_windows, train_on_validation
@@ -16,6 +19,7 @@ from plushsense.jobs.progress import JobProgress
 from plushsense.scoring.metrics import summary
 from plushsense.workflow.api import FoldsSpec, evaluate_run
 from plushsense.workflow.preparation import Run, silent
+from plushsense.workflow.reporting import LEARNING
 
 MORE_PEOPLE = 3
 _FEWEST_TESTED = 3
@@ -32,7 +36,7 @@ class LearningPoint:
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """How the accuracy grows with the number of people to train on.
+    """Accuracy for people left out by the number of people to train on, and what further people would add.
 
     Attributes:
         points: by the number of people, ascending.
@@ -75,6 +79,12 @@ def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int =
     if gain.mean is None or gain.ci95 is None:
         return None
     return LearningCurve(means, more, gain.mean, gain.ci95)
+
+
+def save_curve(curve: LearningCurve, run: Run, out: Path) -> None:
+    """Write a curve beside the evaluation of ``run`` in the folder ``out``, with the id by which it belongs to it."""
+    with run.dataset.generation.writing():
+        write_file(out / LEARNING, json.dumps(curve.to_json() | {"id": run.id}))
 
 
 def accuracies(result: EvaluationResult) -> dict[str, float | None]:

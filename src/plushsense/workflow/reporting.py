@@ -261,16 +261,16 @@ def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:
         ) from None
     except (OSError, ValueError, RecursionError) as error:
         raise BadInput(f"'{path}' is not an evaluation ({error}): give a folder written by evaluate.") from None
-    return table | {"learning": _learning(path.with_name(LEARNING))}
+    return table | {"learning": _learning(path.with_name(LEARNING), table.get("id"))}
 
 
-def _learning(path: Path) -> dict[str, Any] | None:
-    """Read the learning curve beside an evaluation (`plushsense.workflow.learning`); None if there is none."""
+def _learning(path: Path, identity: object) -> dict[str, Any] | None:
+    """Read the curve beside an evaluation (`plushsense.workflow.learning`); None if there is none, or another's."""
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    return table if isinstance(table, dict) else None
+    return table if isinstance(table, dict) and table.pop("id", None) == identity else None
 
 
 def _evaluation_table(source: EvaluationResult | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:

@@ -246,12 +246,11 @@ def baselines(
             data, an error is raised unless ``overwrite``.
     """
     spec, dataset = spec or ComparisonSpec(), as_dataset(dataset)
-    inputs = dataset.layout.inputs
     given = from_settings(config, **settings)
     if given.windows.context == ANYWHERE:
         raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
     run = prepare(dataset, given, warn)
-    dataset, identity = run.dataset, comparison_id(run, spec)
+    inputs, dataset, identity = dataset.layout.inputs, run.dataset, comparison_id(run, spec)
     if out is not None:
         _require_reports()
         check_results(Path(out), "A comparison", TABLE, identity, replace=overwrite)
