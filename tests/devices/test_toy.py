@@ -295,10 +295,27 @@ def test_a_scenario_breaks_a_connection_and_takes_it_up_again() -> None:
         assert isinstance(device, ReconnectingDevice)
         while running.counters is None or not device.counters.reconnects or device.state == "connected":
             got += [(frame.device_ms, frame.values) for frame in device.read() or []]
+        assert device.counters.reconnects == 1
     expected = in_process(scenario_with(*FAULTS))[0]
     first = next(n for n, pair in enumerate(expected) if n >= len(got) or pair != got[n])
     assert got == expected[:first] + expected[first + 50 :], "half a second is missing"
     assert running.counters is not None and running.counters.connections == 2
+
+
+def test_nobody_listens_any_more_when_a_reader_sees_the_end() -> None:
+    refused = []
+
+    class Reader:
+        def close(self) -> None:
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection((server.HOST, port.port), timeout=60)
+            refused.append(True)
+
+    port = server._TcpPort(ToyServer(), 0)
+    port.open()
+    port.client = Reader()  # type: ignore[assignment]
+    port.disconnect()
+    assert refused == [True]
 
 
 @needs_pty

@@ -257,8 +257,8 @@ class _TcpPort(_Port):
             return False
 
     def disconnect(self) -> None:
-        """As in `_Port`."""
-        for end in (self.client, self.server):
+        """As in `_Port`; first stop listening, since a reader may connect again as soon as it sees the end."""
+        for end in (self.server, self.client):
             if end is not None:
                 end.close()
         self.server = self.client = self.outlet = None
