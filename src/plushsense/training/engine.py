@@ -22,6 +22,7 @@ from plushsense.models.net import Net
 from plushsense.training.augment import Transform
 from plushsense.training.fast.net import FastNet, can_train
 from plushsense.training.fast.plan import plan_net
+from plushsense.training.fast.vectors import FastVectors
 from plushsense.training.spec import EpochRow, TrainSpec
 
 import torch  # isort: skip - after models.net, which says how to install it
@@ -92,7 +93,7 @@ class FitState:
 # Windows at a time without gradients.
 _EVAL_BATCH = 512
 
-# Values that a vector layer keeps for its gradient, for each of its outputs.
+# Values that a vector layer keeps for its gradient and needs to compute it, for each of its outputs.
 _VECTOR_VALUES = 8
 
 
@@ -101,7 +102,8 @@ class Windows:
 
     def __init__(self, x: NDArray[np.float32], arch: Arch, device: torch.device) -> None:
         whole = torch.from_numpy(x)
-        self.time_first = whole.permute(2, 0, 1).contiguous() if is_fast(arch, device) else None
+        fills = is_fast(arch, device) and arch.vector is None
+        self.time_first = whole.permute(2, 0, 1).contiguous() if fills else None
         self.whole = whole.to(device) if self.time_first is None else self.time_first.permute(1, 2, 0)
 
     def __len__(self) -> int:
@@ -224,15 +226,15 @@ class Plain:
 
 
 class Fast:
-    """Training with ``training/fast``, and PyTorch's gradients for a vector layer; methods as in `Plain`."""
+    """Training with ``training/fast``; methods as in `Plain`."""
 
     def __init__(self, net: Net, batch: int, threads: int) -> None:
         self._net = FastNet(net, batch, threads)
-        self._vectors = net.vectors
+        self._vectors = None if net.vectors is None else FastVectors(net.vectors, net.arch.span)
 
     @property
     def parameters(self) -> Sequence[Tensor]:
-        return [*([] if self._vectors is None else self._vectors.parameters()), *self._net.parameters]
+        return [*([] if self._vectors is None else self._vectors.parameters), *self._net.parameters]
 
     @property
     def decayed(self) -> Sequence[Tensor]:
@@ -242,48 +244,37 @@ class Fast:
     def step(
         self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        windows = None
-        if augment is not None:
-            windows = augment(x.whole[batch], random)
-        if self._vectors is not None:
-            self._vectors.train()
-            with torch.enable_grad():
-                windows = self._vectors(x.whole[batch] if windows is None else windows)
-        if windows is None:
-            source = x.time_first
-            assert source is not None
+        source, vectors = x.time_first, self._vectors
+        windows = x.whole[batch] if source is None or augment is not None else None
+        if augment is not None and windows is not None:
+            windows = augment(windows, random)
+        if vectors is not None and windows is not None:
+            vectors.forward(windows)
 
-            def fill(out: Tensor, start: int, end: int) -> None:
+        def fill(out: Tensor, start: int, end: int) -> None:
+            if vectors is not None:
+                vectors.fill(out, start, end)
+            elif windows is not None:
+                out.copy_(windows[start:end].permute(2, 0, 1))
+            elif source is not None:
                 torch.index_select(source, 1, batch[start:end], out=out)
-        else:
-            ready = windows.detach().permute(2, 0, 1)
-
-            def fill(out: Tensor, start: int, end: int) -> None:
-                out.copy_(ready[:, start:end])
 
         loss, logits, gradient = self._net.step(fill, y)
-        if self._vectors is not None and windows is not None and gradient is not None:
-            self._vectors.zero_grad(set_to_none=True)
-            torch.autograd.backward(windows, gradient.permute(1, 2, 0))
+        if vectors is not None and gradient is not None:
+            vectors.backward(gradient)
         return loss, logits
 
     def logits(self, x: Windows) -> Tensor:
-        source, vectors = x.time_first, self._vectors
-        assert source is not None
-        if vectors is not None:
-            vectors.eval()
+        vectors = self._vectors
 
         def fill(out: Tensor, start: int, end: int) -> None:
-            if vectors is None:
-                out.copy_(source[:, start:end])
-            else:
-                with torch.no_grad():
-                    out.copy_(vectors(x.whole[start:end]).permute(2, 0, 1))
+            windows = x.whole[start:end]
+            out.copy_(windows.permute(2, 0, 1) if vectors is None else vectors.read(windows))
 
         return self._net.logits(fill, len(x))
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        return self._net.export_weights() | ({} if self._vectors is None else self._vectors.export_weights())
+        return self._net.export_weights() | ({} if self._vectors is None else self._vectors.net.export_weights())
 
     def close(self) -> None:
         self._net.close()
