@@ -28,8 +28,8 @@ from plushsense.cli.main import main, parser_of
 from plushsense.cli.options import VERBS
 from plushsense.deploy.proof.verify import Setting
 from plushsense.experiments.baselines.run_baselines import chosen
-from plushsense.live.adaptation import DENSE
 from plushsense.models.bundle import Bundle
+from plushsense.models.reference import DENSE
 from plushsense.recording.simulate import SimulationSpec, simulate
 from plushsense.studio.app import serve
 from plushsense.workflow.api import import_simulation

@@ -13,8 +13,9 @@ from plushsense.core.layouts import load_layout
 from plushsense.deploy.quantize import Ranges, calibrated, calibration, integer_model, integer_network, quantize
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.reference import random_weights
+from plushsense.models.reference import divide_logits, random_weights
 from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.fixed import LOGIT_LIMIT
 from plushsense.runtime.integer import MOST_REACH
 from plushsense.windows.features import Scaler
 
@@ -47,6 +48,21 @@ def test_the_whole_numbers_answer_as_the_floats_do(padding: str, norm: str) -> N
     found = integer_network(bundle).forward(x) / 256
     assert (expected.argmax(axis=1) == found.argmax(axis=1)).mean() > 0.95
     assert np.abs(expected - found).max() < 0.15 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("temperature", [0.4, 1.7, 6.0])
+def test_a_temperature_divides_the_logits_and_changes_no_answer(temperature: float) -> None:
+    plain = calibrated(make(), windows())
+    bundle = replace(plain, weights=divide_logits(plain.weights, temperature))
+    x = windows(seed=1, n=200)
+    before, after = (b.network().forward(b.scaler.apply(x)) for b in (plain, bundle))
+    np.testing.assert_allclose(after, before / temperature, rtol=1e-5, atol=1e-5)
+    assert (after.argmax(axis=1) == before.argmax(axis=1)).all()
+    one, other = integer_network(plain), integer_network(bundle)
+    # Only the scale of the last sums changes, so the resolution of 8 bits stays what it is.
+    assert np.array_equal(one.dense.weights, other.dense.weights) and np.array_equal(one.dense.bias, other.dense.bias)
+    exact = np.clip(one.forward(x) / temperature, -LOGIT_LIMIT, LOGIT_LIMIT)
+    np.testing.assert_allclose(other.forward(x), exact, rtol=1e-3, atol=1.5 + 1.5 / temperature)  # steps of 1/256
 
 
 def test_the_biases_undo_what_rounding_the_weights_does_to_the_mean() -> None:

@@ -26,7 +26,7 @@ from support.fakes import AFFECTS, LABELS, Memory, Oracle, misshapen, refuses, s
 KEYS = {
     "split", "context", "train_context", "leaky", "seeds", "accuracy", "macro_f1", "macro_recall",
     "macro_f1_all_classes", "with_rest", "over", "by_recording", "pooled", "per_class", "confusion", "confusion_affect",
-    "by_context", "nobody", "folds", "subjects", "histories", "predictions", "leakage",
+    "by_context", "nobody", "folds", "subjects", "histories", "predictions", "leakage", "confidence",
 }  # fmt: skip
 
 

@@ -56,6 +56,22 @@ def test_the_two_contexts_are_told_apart():
     assert title == "by-subject:5, trained on loops, scored on real context"
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "error over 15 bins is 0.192 (95 % interval over people 0.120 to 0.310). With temperatures"),
+        ({}, "it is 0.066; for a network of everybody: train --temperature 1.75."),
+        ({"temperature": None, "error_tempered": 0.19}, "Temperatures do not clearly lower it (0.190)."),
+        ({"temperature": None, "error_tempered": None, "ci95": None, "error_int8": 0.2}, "0.192, in 8 bits 0.200."),
+    ],
+)
+def test_how_sure_the_networks_are(changes, said):
+    found = {"mean": 0.743, "error": 0.192, "ci95": [0.12, 0.31], "error_int8": None, "temperature": 1.75}
+    sentence = wording.describe_confidence(found | {"error_tempered": 0.066} | changes)
+    assert said in sentence and ("--temperature" in sentence) == (changes == {})
+    assert dict(wording.describe_protocol({"confidence": found | {"error_tempered": 0.066} | changes}))["Confidence"]
+
+
 def test_recordings_at_rest_are_named_apart_only_where_they_are() -> None:
     people = {"over": "subjects", "subjects": [{}, {}], "nobody": {"recordings": 2}, "split": "by-subject:2"}
     assert "2 people, without recordings at rest;" in wording.describe_spread(people)

@@ -99,6 +99,16 @@ def test_calibration_error_by_hand() -> None:
     assert np.isnan(metrics.calibration_error(p[:0], np.zeros(0, np.int64)))
 
 
+def test_the_interval_of_the_calibration_error_is_over_people() -> None:
+    # One person is always right, one never, at the same confidence: the error depends on whom a resample has.
+    p = np.full((20, 2), [0.6, 0.4])
+    truth, person = np.repeat([0, 1], 10), np.repeat(["P1", "P2"], 10)
+    assert metrics.calibration_error(p, truth) == pytest.approx(0.1)
+    low, high = metrics.calibration_interval(p, truth, person)
+    assert (low, high) == (pytest.approx(0.1), pytest.approx(0.6))
+    assert metrics.calibration_interval(p[:10], truth[:10], person[:10]) is None
+
+
 def test_a_class_index_below_0_is_refused_and_the_highest_accepted() -> None:
     top, low = np.array([2]), np.array([-1])
     assert metrics.confusion(top, top, 3)[2, 2] == 1

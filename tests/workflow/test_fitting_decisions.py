@@ -7,12 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import plushsense as ps
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.runtime.decisions import DecideSpec
+from plushsense.scoring.temperature import tempered
+from plushsense.workflow.api import validation_predictions
 
 pytestmark = pytest.mark.apart("trainings")
 
@@ -65,3 +68,20 @@ def test_without_a_stream_decisions_are_fitted_on_recordings(recordings: Path, t
     plain = import_recordings(tmp_path / "src", tmp_path / "plain", layout="accel-3").dataset
     fitted = ps.train(plain, epochs=1, filters=(4, 4, 4)).bundle.decision["fitted"]
     assert fitted["streams"] == 0 and "windows" in fitted["answers"]["on"]
+
+
+def test_a_temperature_is_in_the_weights_before_anything_is_fitted(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    plain, done = (
+        ps.train(dataset, filters=(4, 4, 4), epochs=4, temperature=temperature) for temperature in (1.0, 1.5)
+    )
+    for name, weight in plain.bundle.weights.items():
+        divided = weight / np.float32(1.5) if name.startswith("dense.") else weight
+        np.testing.assert_array_equal(done.bundle.weights[name], divided)
+    assert done.scores.accuracy == plain.scores.accuracy
+    one, other = (validation_predictions(t.bundle, dataset).probabilities for t in (done, plain))
+    np.testing.assert_allclose(one, tempered(other, 1.5), atol=1e-6)
+    # The margin is of logits, which are divided as well.
+    assert done.bundle.decision["known_margin"] == pytest.approx(plain.bundle.decision["known_margin"] / 1.5, abs=0.1)
+    assert done.bundle.provenance["temperature"] == 1.5 and "temperature" not in plain.bundle.provenance
+    ran = cli("train", dataset.path, *SMALL, "--temperature", "0.1", "--out", tmp_path / "m.plush")
+    assert ran.status == 2 and "The temperature is 0.1: accepted are 0.14 to 7.4" in ran.err

@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 def lines(e: dict[str, Any]) -> list[str]:
     """Format the scores of an evaluation as text: a row for each person, then the means."""
-    from plushsense.reports.wording import describe_leakage, describe_learning
+    from plushsense.reports.wording import describe_confidence, describe_leakage, describe_learning
     from plushsense.scoring.metrics import METRICS, column_metrics
 
     names = {key: metric.name for key, metric in column_metrics().items()}
@@ -90,6 +90,8 @@ def lines(e: dict[str, Any]) -> list[str]:
         out.append(f"{title}{', with recordings at rest' if rest and title == 'pooled windows' else ''}: {scores}")
     for kind, part in e["by_context"].items():
         out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({plural(part['windows'], 'window')})")
+    if e.get("confidence"):
+        out.append(describe_confidence(e["confidence"]))
     if "leakage" in e:
         out.append(describe_leakage(e["leakage"]))
     if curve := e.get("learning"):

@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     done = train(
         args.dataset,
         settings(args),
-        **options(args, "quantize_aware", "fit_decisions"),
+        **options(args, "quantize_aware", "temperature", "fit_decisions"),
         journal=unfinished(args.dataset),
         progress=report_epochs(),
         warn=warn,

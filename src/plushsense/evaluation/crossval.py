@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import NOBODY
+from plushsense.evaluation.confidence import ConfidenceResult, assess_confidence
 from plushsense.evaluation.leakage import LeakageResult, audit_leakage
 from plushsense.evaluation.scores import (
     FoldRecord,
@@ -171,7 +172,8 @@ class EvaluationResult:
     """The outcome of `evaluate`.
 
     ``leakage`` is the result of `audit_leakage`; ``int8`` compares the deployed networks with the float ones;
-    ``self_calibration`` is that of the windows; ``histories`` has the epochs of each fold.
+    ``confidence`` is None if no window is of a person; ``self_calibration`` is that of the windows; ``histories`` has
+    the epochs of each fold.
     """
 
     split: Split
@@ -181,6 +183,7 @@ class EvaluationResult:
     scores: Scores
     leakage: LeakageResult
     self_calibration: str
+    confidence: ConfidenceResult | None
     int8: DeployedResult | None
     histories: list[list[EpochRow]]
     predictions: Predictions
@@ -201,6 +204,7 @@ class EvaluationResult:
             "seeds": self.seeds,
             **self.scores.to_json(),
             "leakage": self.leakage.to_json(),
+            "confidence": None if self.confidence is None else self.confidence.to_json(),
             **({"self_calibration": self.self_calibration} if self.self_calibration else {}),
             **({"int8": self.int8.to_json()} if self.int8 is not None else {}),
             "histories": self.histories,
@@ -300,7 +304,7 @@ def _result(
         return predictions, compute_scores(predictions, records, score.affects, split.separates_people)
 
     predictions, scores = scored("probabilities")
-    int8 = None
+    int8 = deployed = None
     if all("deployed" in outcome for outcome in outcomes):
         deployed, after = scored("deployed")
         int8 = compare_deployed(scores, after, predictions, deployed)
@@ -312,6 +316,7 @@ def _result(
         scores=scores,
         leakage=audit_leakage(train, score, folds, shared_rows()),
         self_calibration=score.self_calibration,
+        confidence=assess_confidence(predictions, deployed, split.separates_people),
         int8=int8,
         histories=[with_accuracy(outcome["history"], split.separates_people) for outcome in outcomes],
         predictions=predictions,

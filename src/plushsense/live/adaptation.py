@@ -26,12 +26,11 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, BundleError, ConfigError
 from plushsense.models.bundle import Bundle
-from plushsense.models.reference import softmax
+from plushsense.models.reference import DENSE, softmax
 
 Floats = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-DENSE = ("dense.weight", "dense.bias")
 _LEAST_PROBABILITY = 1e-9
 _ITERATIONS = 320  # logits are then within 1e-4 of the optimum on makeability, with the smallest strength
 

@@ -29,7 +29,7 @@ from plushsense.core.toml import check_table, load_table
 from plushsense.dataset.readings import Readings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.models.arch import Arch
-from plushsense.models.reference import CHUNK, Network, check_weights
+from plushsense.models.reference import CHUNK, DENSE, Network, check_weights
 from plushsense.windows.features import Scaler
 
 FORMAT = "plushsense-bundle"
@@ -40,7 +40,6 @@ _AGAIN = "copy it again from where it came, or train again"
 
 # Offsets and scales beyond them cannot come from 32-bit values.
 _MOST_OFFSET, _SCALES = 2.0**40, (1e-15, 1e9)
-_DENSE = ("dense.weight", "dense.bias")
 # Larger weights and calibrations could overflow in four layers of floats; seconds of windows are few.
 _MOST_WEIGHT = 1e20
 _MOST = {"calibration": 1e30, "windowing": 1e6}
@@ -285,7 +284,7 @@ class Bundle:
         """Raise BundleError if the layer before an adaptation does not fit the network."""
         if earlier := self.personal.get("original"):
             with np.errstate(over="ignore"):
-                layer = {name: np.array(earlier[name], dtype=np.float32) for name in _DENSE}
+                layer = {name: np.array(earlier[name], dtype=np.float32) for name in DENSE}
             check_weights(self.arch, {**self.weights, **layer})
 
     def _implied(self) -> dict[str, Any]:

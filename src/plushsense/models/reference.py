@@ -20,6 +20,7 @@ from plushsense.models.vectors import VectorStage
 
 Floats = NDArray[np.float64]
 
+DENSE = ("dense.weight", "dense.bias")
 CHUNK = 256  # samples processed at once, few enough for their taps to stay in the cache
 
 
@@ -131,6 +132,11 @@ def check_weights(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> None:
             raise BundleError(f"The weights '{name}' hold a value that is not finite: train again.")
         if name.endswith(".var") and (found < 0).any():
             raise BundleError(f"The weights '{name}' hold a negative variance: train again.")
+
+
+def divide_logits(weights: Mapping[str, NDArray[np.float32]], by: float) -> dict[str, NDArray[np.float32]]:
+    """Return the weights of the network whose logits are those of this one divided by a number."""
+    return {**weights, **{name: np.asarray(weights[name] / np.float32(by)) for name in DENSE}}
 
 
 def affine(arch: Arch, i: int, weights: Weights) -> tuple[Floats, Floats]:

@@ -83,6 +83,8 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
     if evaluation.get("self_calibration"):
         how = "Offset and scale of accelerometers: causal, from the readings of the session so far, without labels."
         answers.append(("Self-calibration", how))
+    if confidence := evaluation.get("confidence"):
+        answers.append(("Confidence", describe_confidence(confidence)))
     if audit := evaluation.get("leakage"):
         answers.append(("Leakage audit", describe_leakage(audit)))
     return answers
@@ -96,6 +98,26 @@ def describe_learning(learning: Mapping[str, Any]) -> str:
         f"Training with {learning['more']} more people would change the accuracy by {learning['gain']:+.3f} (95 % "
         f"interval {low:+.3f} to {high:+.3f}), by a learning curve over {people} people to train on."
     )
+
+
+def describe_confidence(confidence: Mapping[str, Any]) -> str:
+    """Describe how well confidence and correctness agree (`plushsense.evaluation.confidence`) in a few sentences."""
+    ci95, int8 = confidence.get("ci95"), confidence.get("error_int8")
+    interval = f" (95 % interval over people {ci95[0]:.3f} to {ci95[1]:.3f})" if ci95 else ""
+    deployed = f", in 8 bits {int8:.3f}" if int8 is not None else ""
+    sentence = (
+        f"The mean confidence is {confidence['mean']:.3f}; its expected calibration error over 15 bins is "
+        f"{confidence['error']:.3f}{interval}{deployed}."
+    )
+    tempered, temperature = confidence.get("error_tempered"), confidence.get("temperature")
+    if temperature is not None:
+        sentence += (
+            f" With temperatures, each fitted to the people of the other folds, it is {tempered:.3f}; for a network of "
+            f"everybody: train --temperature {temperature:.2f}."
+        )
+    elif tempered is not None:
+        sentence += f" Temperatures do not clearly lower it ({tempered:.3f})."
+    return sentence
 
 
 def describe_leakage(audit: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ Counts = NDArray[np.int64]
 
 RESAMPLES = 10_000
 BOOTSTRAP_SEED = 20_260
+_BINS = 15  # of confidence
 
 
 def confusion(truth: NDArray[np.int64], predicted: NDArray[np.int64], classes: int) -> Counts:
@@ -189,14 +190,40 @@ def vote(
 def calibration_error(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.int64]) -> float:
     """Return the expected calibration error (ECE) of predictions (N, K); NaN without any.
 
-    It is the difference between highest probability and accuracy, averaged over ten bins of equal width by their
-    numbers of predictions (Guo et al. 2017).
+    It is the difference between highest probability and accuracy, averaged over 15 bins of equal width by their numbers
+    of predictions (Guo et al. 2017).
     """
+    if not len(truth):
+        return float("nan")
+    return float(np.abs(_bin_gaps(probabilities, truth)).sum() / len(truth))
+
+
+def calibration_interval(
+    probabilities: NDArray[np.floating[Any]], truth: NDArray[np.int64], person: NDArray[np.str_]
+) -> tuple[float, float] | None:
+    """Return the 95 % interval of the calibration error over people; None for fewer than two.
+
+    It is a percentile bootstrap of whole people. Few people raise the error of a resample, since their chance
+    deviations do not cancel; so the interval errs on the high side.
+    """
+    people = [person == who for who in np.unique(person)]
+    if len(people) < 2:
+        return None
+    gaps = np.stack([_bin_gaps(probabilities[own], truth[own]) for own in people])
+    sizes = np.array([own.sum() for own in people])
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    drawn = rng.multinomial(len(people), np.full(len(people), 1 / len(people)), size=RESAMPLES)
+    low, high = np.percentile(np.abs(drawn @ gaps).sum(axis=1) / (drawn @ sizes), [2.5, 97.5])
+    return float(low), float(high)
+
+
+def _bin_gaps(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the sum of confidence minus correctness in each bin of confidence, (_BINS,)."""
     confidence = probabilities.max(axis=1).astype(np.float64)
     right = probabilities.argmax(axis=1) == truth
-    place = np.minimum((confidence * 10).astype(np.int64), 9)
-    gaps = np.abs(np.bincount(place, weights=confidence - right, minlength=10))
-    return float(gaps.sum() / len(truth)) if len(truth) else float("nan")
+    place = np.minimum((confidence * _BINS).astype(np.int64), _BINS - 1)
+    gaps = np.bincount(place, weights=confidence - right, minlength=_BINS)
+    return np.asarray(gaps, dtype=np.float64)
 
 
 class Summary(NamedTuple):

@@ -45,6 +45,7 @@ from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle, is_training_content
 from plushsense.runtime.decisions import DecideSpec
+from plushsense.scoring.temperature import check_temperature
 from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
 from plushsense.windows.cut import ANYWHERE, WindowSet
@@ -198,6 +199,7 @@ def train(
     config: RunConfig | None = None,
     *,
     quantize_aware: int = 0,
+    temperature: float = 1.0,
     fit_decisions: bool = True,
     journal: Journal | None = None,
     progress: EpochProgress | None = None,
@@ -216,6 +218,8 @@ def train(
     Args:
         config: settings; alternatively give them by name (see `from_settings`), as in ``preset="loso", epochs=20``.
         quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`).
+        temperature: number that divides the logits, so that the network is as sure as it is right; an evaluation
+            proposes it (`plushsense.evaluation.confidence`). It becomes part of the weights, before all fitting.
         fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`), but for those
             in ``config.live`` that differ from the defaults.
         journal: stores the progress of the training (see `unfinished`), so that an interrupted one resumes and gives
@@ -226,6 +230,7 @@ def train(
     """
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
+    check_temperature(temperature)
     made = prepare_training(dataset, from_settings(config, **settings), warn, deployable=quantize_aware > 0)
     run, scored, dataset, apart = made.run, made.scored, made.run.dataset, made.split.separates_people
 
@@ -233,12 +238,12 @@ def train(
         if progress is not None:
             progress(epoch, epochs, with_accuracy([row], apart)[0])
 
-    trainer = NetworkTrainer(run, made.windows, made.kind == WHOLE_PEOPLE, quantize_aware, journal, report)
+    trainer = NetworkTrainer(run, made.windows, made.kind == WHOLE_PEOPLE, quantize_aware, temperature, journal, report)
     checked = trainer.train(made.train, scored.take(made.validation), made.fold.subjects)
     nothing, everything = scored.take(made.validation[:0]), np.arange(len(made.windows))
     final = trainer.train(everything, nothing, what=REFIT) if made.refit else checked
     predictions, scores = _validated(made, checked, warn)
-    bundle = _bundle(made, final, scores, quantize_aware)
+    bundle = _bundle(made, final, scores, quantize_aware, temperature)
     if fit_decisions:
         reader = replace(bundle, weights=checked.weights, scaler=checked.fitted.scaler)
         bundle = replace(bundle, decision=_decisions(reader, dataset, run.live, warn))
@@ -254,7 +259,9 @@ def train(
     return Trained(bundle, history, scores, seconds, dataset.generation)
 
 
-def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScores, quantize_aware: int) -> Bundle:
+def _bundle(
+    made: PreparedTraining, final: TrainedNetwork, scores: TrainingScores, quantize_aware: int, temperature: float
+) -> Bundle:
     """Return the bundle of a trained network, with the decision settings that were given."""
     run = made.run
     people = sorted({str(s) for s in made.windows.subject[final.at]})
@@ -279,6 +286,7 @@ def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScore
             "preset": run.preset,
             "training": run.training.to_dict(),
             "quantize_aware": quantize_aware,
+            **({"temperature": temperature} if temperature != 1.0 else {}),
             "scores": scores.to_json(),
             "code_version": __version__,
         },

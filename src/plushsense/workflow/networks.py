@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from plushsense.deploy.quantize import calibration
 from plushsense.evaluation.crossval import windows_fingerprint
 from plushsense.jobs.journal import Journal, job_id, keep_if_possible
+from plushsense.models.reference import divide_logits
 from plushsense.training.spec import EpochProgress, EpochRow
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.preparation import Run, outside_streams
@@ -32,8 +33,9 @@ REFIT = "training again, on everybody"
 class TrainedNetwork:
     """A trained network: the indices ``at`` of its windows, its fit, its ``weights``, and ``ranges`` for 8 bits.
 
-    ``weights`` are those of the fit, or if ``tuned``, those after fine-tuning for 8 bits; ``ranges`` is the result of
-    `plushsense.deploy.quantize.calibration`; ``seconds`` includes those before an interruption.
+    ``weights`` are those of the fit, or if ``tuned``, those after fine-tuning for 8 bits, with the temperature;
+    ``ranges`` is the result of `plushsense.deploy.quantize.calibration`; ``seconds`` includes those before an
+    interruption.
     """
 
     at: NDArray[np.int64]
@@ -51,6 +53,7 @@ class NetworkTrainer:
     Attributes:
         by_people: whether nothing from the streams of people who are left out may be used.
         quantize_aware: epochs of fine-tuning for 8 bits.
+        temperature: number that divides the logits of every network.
         journal: stores unfinished trainings, each under an id of all that its outcome depends on; None for none.
         progress: as for `fit`.
     """
@@ -59,6 +62,7 @@ class NetworkTrainer:
     windows: WindowSet
     by_people: bool
     quantize_aware: int
+    temperature: float
     journal: Journal | None
     progress: EpochProgress
     _stored: list[str] = field(default_factory=list)
@@ -108,6 +112,7 @@ class NetworkTrainer:
             from plushsense.training.quantized import fine_tune
 
             weights = fine_tune(train_on, network, fitted, ranges, spec, self.quantize_aware, epoch_done)
+        weights = divide_logits(weights, self.temperature)
         return TrainedNetwork(at, fitted, weights, ranges, fitted.seconds + before_s, self.quantize_aware > 0)
 
     def _job(self, train: WindowSet, watched: WindowSet) -> str:
