@@ -23,10 +23,11 @@ def test_labels_are_found_as_file_names_spell_them() -> None:
         gestures.get("Tail pul")
 
 
-def test_inferred_sets_know_free_choice() -> None:
+def test_inferred_sets_know_free_choice_and_idleness() -> None:
     found = GestureSet.infer(["Shake", "Custom", "At Rest", "Shake"])
     assert found.labels == ("At Rest", "Custom", "Shake")
     assert [g.free_choice for g in found.gestures] == [False, True, False]
+    assert [g.idle for g in found.gestures] == [True, False, False]
     assert GestureSet.from_dict(found.to_dict()) == found
 
 

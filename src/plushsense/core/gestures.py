@@ -16,6 +16,8 @@ from plushsense.core.toml import builtin_names, load_table, read_named
 AFFECTS = ("positive", "neutral", "negative", "none")
 NOBODY = "none"
 FAMILY, AFFECT = "family", "affect"
+IDLE_LABELS = frozenset({"at rest", "idle", "no gesture", "no touch", "nothing", "rest"})
+"""Labels, in the form of `plain_label`, of recordings in which nothing happens, where no gesture set says more."""
 
 
 def plain_label(label: str) -> str:
@@ -229,12 +231,15 @@ class GestureSet:
         """Create a gesture set from the labels of recordings, in alphabetical order, with unknown affects.
 
         Labels that differ only in case, or in ``_`` and spaces, become one gesture with the first spelling. ``Custom``
-        is the GestureRecorder's label for a gesture of free choice.
+        is the GestureRecorder's label for a gesture of free choice, and the labels of `IDLE_LABELS` are idle.
         """
         spellings: dict[str, str] = {}
         for label in labels:
             spellings.setdefault(plain_label(label), label)
-        gestures = tuple(Gesture(s, free_choice=plain_label(s) == "custom") for s in sorted(spellings.values()))
+        gestures = tuple(
+            Gesture(label, free_choice=plain == "custom", idle=plain in IDLE_LABELS)
+            for plain, label in sorted(spellings.items(), key=lambda pair: pair[1])
+        )
         return cls(name, gestures, inferred=True)
 
 

@@ -109,7 +109,7 @@ def describe_confidence(confidence: Mapping[str, Any]) -> str:
         f"The mean confidence is {confidence['mean']:.3f}; its expected calibration error over 15 bins is "
         f"{confidence['error']:.3f}{interval}{deployed}."
     )
-    tempered, temperature = confidence.get("error_tempered"), confidence.get("temperature")
+    tempered, temperature = confidence["error_tempered"], confidence["temperature"]
     if temperature is not None:
         sentence += (
             f" With temperatures, each fitted to the people of the other folds, it is {tempered:.3f}; for a network of "

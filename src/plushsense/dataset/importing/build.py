@@ -330,8 +330,16 @@ def _key_of(path: str, *, companion: bool) -> str:
 
 
 def label_notes(given: GestureSet | None, labels: Iterable[str]) -> Iterator[Message]:
-    """Yield warnings about labels that look like one gesture, and that a set, which was not inferred, has not."""
+    """Yield warnings about labels that look idle or alike, and about those that a given set lacks."""
     counts = Counter(labels)
+    if given is None:
+        for gesture in GestureSet.infer(counts).gestures:
+            if gesture.idle:
+                yield Message(
+                    "'{label}' counts as idle by its name, and never starts an event: if the toy is touched in these "
+                    "recordings, rename them, or give --gestures a set that has it",
+                    label=gesture.label,
+                )
     known = () if given is None or given.inferred else given.labels
     lacks = [label for label in counts if given is not None and known and given.find(label) is None]
     for group in alike_labels((*known, *counts)):
