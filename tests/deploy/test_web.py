@@ -67,11 +67,12 @@ said.after = rows.splice(0);
 said.events = toy.events().every((e) => ["begun", "named", "ended"].includes(e.what));
 said.counts = toy.counts();
 said.patches = [images[1], images[0]].map((image) => refused(() => toy.patch(bytes(image))));
-const wrong = [[[1], 5], [null, 5], [[1, 2, 3]], [[1, 2, 3], NaN], [[1, 2, 3], "5"]];
+const wrong = [[[1], 5], [null, 5], [[1, 2, 3]], [[1, 2, 3], NaN], [[1, 2, 3], "5"], [[1, 2, 3], 5n]];
+wrong.push([[1n, 2n, 3n], 5], [[1, "x", 3], 5], [[1, Object.create(null), 3], 5], [[Symbol("one"), 2, 3], 5]);
 said.reading = wrong.map((given) => refused(() => toy.push(...given)));
 said.nothing = refused(() => toy.swap("text"));
-toy.sensitivity = 300;
-said.sensitivity = toy.sensitivity;
+said.sensing = ["x", "5", 1.5, 5n, NaN, null, undefined, {}].map((steps) => refused(() => (toy.sensitivity = steps)));
+said.sensitivity = [300, 2 ** 40, -129, -7].map((steps) => { toy.sensitivity = steps; return toy.sensitivity; });
 toy.restart();
 toy.push([null, 1, 2], 2 ** 32 - 10);
 said.waiting = toy.counts().reading;
@@ -123,13 +124,18 @@ def test_the_library_in_javascript(in_node: None, tmp_path: Path) -> None:
         expected = expected[expected[:, 0] == ANSWER]
         assert [row[:5] for row in said[name]] == expected[:, at].tolist(), name
         assert len(expected) > 20 and expected.shape[1] == HEAD + 2 * said[name][0][5]
-    refusals = [*said["opening"], *said["wasm"], *said["swapping"], *said["patches"], *said["reading"], said["nothing"]]
+    lists = ("opening", "wasm", "swapping", "patches", "reading", "sensing")
+    refusals = [*(words for name in lists for words in said[name]), said["nothing"]]
     assert all(re.fullmatch(r"[A-Z][^\n]{20,}\.", words) for words in refusals), refusals
     assert set(said["uncaught"]) == {
         "onAnswer and onEvent cannot change the toy that calls them: do it when push() is over."
     }
     assert said["grown"] < 1 << 16 and said["events"] and said["counts"]["restarts"] == 0
-    assert said["sensitivity"] == 127 and said["waiting"] == "waiting" and said["wrapped"] == ["first", "warming"]
+    assert (
+        said["sensitivity"] == [127, 127, -128, -7]
+        and said["waiting"] == "waiting"
+        and said["wrapped"] == ["first", "warming"]
+    )
 
 
 def test_every_number_of_calibrating_sensors_and_what_a_step_costs(in_node: None, tmp_path: Path) -> None:
@@ -160,6 +166,17 @@ def test_the_page_is_one_file_that_asks_for_nothing(in_node: None, tmp_path: Pat
         (body,) = re.findall(rf"<{tag}>(.*?)</{tag.split()[0]}>", page, re.S)
         assert f"'sha256-{base64.b64encode(sha256(body.encode()).digest()).decode()}'" in policy[1]
     assert not re.search(r"(src|href)=\"(?!data:)", page)
+
+
+def test_an_export_says_that_its_page_is_large(
+    in_node: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for filters, said in (("8,12,16", False), ("32,48,64", True)):
+        bundle_of("plush-15", "14d1_19d2_19d4", filters).save(tmp_path / "model.plush")
+        assert main(["export", str(tmp_path / "model.plush"), str(tmp_path / filters)]) == 0
+        size = (tmp_path / filters / PAGE).stat().st_size
+        expected = f"has {-(-size // 1000)} kB: it works, but it is meant to have at most 120 kB"
+        assert (expected in capsys.readouterr().err) == said == (size > 120_000)
 
 
 def test_a_rebuild_is_the_same_and_the_wheel_holds_it(in_node: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,6 +214,6 @@ def test_without_a_compiler(
         # A wheel holds the module.
         (tmp_path / "plushsense.wasm").write_bytes(b"a module")
         done = emit(integer_model(bundle), bundle, tmp_path / "more")
-        assert not done.no_page and (done.folder / MODULE).read_bytes() == b"a module"
+        assert not done.page_note and (done.folder / MODULE).read_bytes() == b"a module"
     finally:
         wasm.module.cache_clear()

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import base64
 import csv
+import gzip
+import io
 import re
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -316,6 +319,18 @@ def test_files_are_read_as_in_python_and_hostile_ones_get_one_sentence(
     ):
         opened.page.set_input_files("#file", {"name": name, "mimeType": "text/csv", "buffer": content})
         opened.until("message", f"“{name}” cannot be played: it is not a recording")
+    text = (tmp_path / "fulldatastream.csv").read_text()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as file:
+        file.writestr("recording.csv", text)
+    for name, content, said in (
+        ("e.csv.gz", gzip.compress(text.encode()), "is packed (gzip or zip)"),
+        ("f.xlsx", packed.getvalue(), "is packed (gzip or zip)"),
+        ("g.csv", text.encode("utf-16"), "is text in UTF-16: save it in UTF-8"),
+        ("h.csv", b"\xfe\xff" + text.encode("utf-16-be"), "is text in UTF-16: save it in UTF-8"),
+    ):
+        opened.page.set_input_files("#file", {"name": name, "mimeType": "text/csv", "buffer": content})
+        opened.until("message", f"“{name}” {said}")
     # A virtual toy's lines, played to their end.
     lines = _bytes(_PLUSH, _stream(_PLUSH, 0.5))
     opened.page.set_input_files("#file", {"name": "virtual toy.txt", "mimeType": "text/plain", "buffer": lines})
@@ -342,7 +357,8 @@ def test_what_happens_is_named_spoken_and_saved_in_both_languages(
     frames = _stream(_PLUSH, 15)
     opened.send(b"\n" + _bytes(_PLUSH, frames))
     opened.until("rows", f"{len(frames)} kadri")
-    # Something is drawn in each lane.
+    # Something is drawn in each lane, once it is in sight.
+    page.locator("#canvas").scroll_into_view_if_needed()
     page.wait_for_function("""() => [...Array(13).keys()].every((lane) => {
       const { width, height } = canvas, begin = height * lane / 13;
       const { data } = canvas.getContext('2d').getImageData(0, begin, width, height / 13);
@@ -373,13 +389,51 @@ def test_what_happens_is_named_spoken_and_saved_in_both_languages(
     assert axe(page) == []
 
 
+def test_pictures_of_the_signals_need_no_frame_of_the_screen_and_only_what_differs_is_written(
+    pages: Callable[..., Opened],
+) -> None:
+    """Frames take most of the processor time where there is no graphics card."""
+    opened = pages()
+    page = opened.page
+    page.evaluate("""() => {
+      window.pictures = window.frames = 0;
+      const { fillRect } = CanvasRenderingContext2D.prototype, later = requestAnimationFrame;
+      CanvasRenderingContext2D.prototype.fillRect = function (...area) { pictures++; fillRect.apply(this, area) };
+      // Playwright asks for frames, too.
+      window.requestAnimationFrame = (draw) => (frames += new Error().stack.includes('index.html'), later(draw));
+    }""")
+    opened.connect()
+    still = [Frame(0, 10 * n, (400,) * 10 + (0, 0, 16_384)) for n in range(600)]
+    opened.send(b"\n" + _bytes(_PLUSH, still))
+    opened.until("state", "No signal from the toy")
+    assert page.evaluate("() => [pictures, frames]") == [0, 0]  # as they are not in sight
+    page.locator("#canvas").scroll_into_view_if_needed()
+    page.wait_for_function("() => pictures")
+    assert page.evaluate("() => frames") == 0
+    assert page.evaluate("() => canvas.getContext('2d').getContextAttributes().desynchronized") is True
+    changed = """() => {
+      const watch = new MutationObserver(() => {}), all = { attributes: true, childList: true, subtree: true };
+      for (const node of document.querySelectorAll('.now, #mark, #message')) watch.observe(node, all);
+      document.getElementById('simulated').dispatchEvent(new Event('change')); // shows all anew
+      return watch.takeRecords().map((record) => record.attributeName ?? record.target.id);
+    }"""
+    assert page.evaluate(changed) == []
+
+
 # What navigator.bluetooth is to the page: a toy that notifies what the test sends.
 _RADIO = """() => {
   const tx = new EventTarget(), device = new EventTarget(), asked = [];
   tx.startNotifications = async () => {};
   const characteristic = { getCharacteristic: async (uuid) => (asked.push(uuid), tx) };
-  const server = { getPrimaryService: async (uuid) => (asked.push(uuid), characteristic) };
-  device.gatt = { connect: async () => server, disconnect: () => {} };
+  const server = { getPrimaryService: async (uuid) => {
+    asked.push(uuid);
+    if (window.lacks) throw lacks;
+    return characteristic;
+  } };
+  device.name = 'Bear';
+  const radio = window.radio = device.gatt = {
+    connect: async () => (radio.connected = true, server), disconnect: () => (radio.connected = false),
+  };
   window.notify = (text) => {
     tx.value = new DataView(Uint8Array.from('..' + text, (c) => c.charCodeAt(0)).buffer, 2);
     tx.dispatchEvent(new Event('characteristicvaluechanged'));
@@ -405,6 +459,25 @@ def test_a_bluetooth_toy_with_older_firmware_is_read_until_it_goes_away(pages: C
     assert opened.page.evaluate("() => plushPage.run.parser.clock") == 10 * (n - 1)
     opened.page.evaluate("() => switchOff()")
     opened.until("message", "The toy went away (disconnected).")
+
+
+def test_a_bluetooth_device_that_is_no_toy_is_let_go(pages: Callable[..., Opened]) -> None:
+    opened = pages(radio=_RADIO)
+    for error, said in (
+        ("NotFoundError", "“Bear” is not a toy that this page can read, as it lacks the service of the Nordic UART"),
+        ("NetworkError", "The toy could not be connected (no service). Close other programs"),
+    ):
+        opened.page.evaluate("(name) => { window.lacks = new DOMException('no service', name) }", error)
+        opened.page.click("#bluetooth")
+        opened.until("message", said)
+        assert opened.page.evaluate("() => radio.connected") is False
+    # Nor is one kept whose model cannot be run.
+    opened.page.evaluate(
+        "() => { delete window.lacks; WebAssembly.instantiate = () => { throw new Error('no memory') } }"
+    )
+    opened.page.click("#bluetooth")
+    opened.until("message", "This browser cannot run the model")
+    assert opened.page.evaluate("() => radio.connected") is False
 
 
 def test_a_button_pressed_twice_opens_one_port_and_the_last_file_chosen_is_played(

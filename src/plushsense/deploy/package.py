@@ -38,7 +38,7 @@ from plushsense.deploy.code import (
 from plushsense.deploy.convert import CONVERTERS, convert
 from plushsense.deploy.golden import measured, write_golden
 from plushsense.deploy.wasm import module
-from plushsense.deploy.web import web_files
+from plushsense.deploy.web import PAGE, large_page, web_files
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
@@ -391,12 +391,12 @@ def _statistics(layout: Layout, scaler: Scaler, readings: Readings | None) -> li
 class ExportResult:
     """Result of an export; ``files`` are relative to ``folder``, the sizes as in `ModelFacts`.
 
-    ``no_page``: why there is no page, as a sentence; empty if there is one.
+    ``page_note``: a sentence, if there is no page, or a larger one than is meant; else empty.
     """
 
     folder: Path
     facts: ModelFacts
-    no_page: str = ""
+    page_note: str = ""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -448,18 +448,20 @@ def emit(
     """
     check_names(name, url=url)
     bundle = bundle.without_people()
-    code, web, no_page = code_files(model, bundle), None, Message()
+    code, web, note = code_files(model, bundle), None, Message()
     try:
         web = module(calibrate=bool(model.layout.self_calibration))
     except ToolError as cause:
-        no_page = cause.message
+        note = cause.message
     with new_folder(out, BadInput) as part:
         conversions = {}
         for other in dict.fromkeys(also):
             done = convert(bundle, part / CONVERTERS[other].file_name, other, windows=windows)
             conversions[other] = ConversionFacts(done.path.name, done.bytes, done.largest_difference, done.notes)
         facts = replace(facts_of(model, bundle, code[IMAGE]), name=name, url=url, conversions=conversions)
-        for file, content in export_files(bundle, facts, code, web).items():
+        contents = export_files(bundle, facts, code, web)
+        note = note or large_page(len(contents.get(PAGE, b"")))
+        for file, content in contents.items():
             (part / file).parent.mkdir(parents=True, exist_ok=True)
             (part / file).write_bytes(content)
         bundle.save(part / BUNDLE)
@@ -468,4 +470,4 @@ def emit(
         facts = replace(facts, files=tuple(sorted({*files, FACTS})))
         text = json.dumps(facts.to_json(), indent=1, ensure_ascii=False)
         (part / FACTS).write_text(text + "\n", "utf-8", newline="\n")
-    return ExportResult(out, facts, no_page)
+    return ExportResult(out, facts, note)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from plushsense.core.errors import ProgramError, ToolError
 from plushsense.core.layouts import Layout, layout_names, load_layout
+from plushsense.core.sentences import Message
 from plushsense.core.templates import fill_text
 from plushsense.deploy.code import ModelFacts
 from plushsense.deploy.wasm import WEB
@@ -24,6 +25,8 @@ SCRIPT = "web/plushsense.js"
 MODULE = "web/plushsense.wasm"
 PAGE = "web/index.html"
 WASM = "wasm"  # the target that runs the module of an export as it is, by way of its plushsense.js, as a page does
+PAGE_BYTES = 120_000
+"""What a page should have at most, to open at once on a slow tablet or Chromebook."""
 _ENGINE = "node"
 # Comments on lines of their own, and indentation: a sixth of the page.
 _SPARE = re.compile(r"^[ \t]*(?://.*\n|/\*(?:.|\n)*?\*/[ \t]*\n)?[ \t]*", re.MULTILINE)
@@ -46,6 +49,18 @@ def web_files(bundle: Bundle, facts: ModelFacts, image: bytes, module: bytes | N
     if module is not None:
         files |= {MODULE: module, PAGE: _page(bundle, facts, image, module).encode()}
     return files
+
+
+def large_page(size: int) -> Message:
+    """Return what to say of a page with so many bytes: a sentence if it is larger than meant, else an empty one."""
+    if size <= PAGE_BYTES:
+        return Message()
+    return Message(
+        "The page web/index.html has {kb} kB: it works, but it is meant to have at most {limit} kB, so that it opens "
+        "at once on a slow tablet or Chromebook; for such a one, train a network with fewer filters.",
+        kb=-(-size // 1000),
+        limit=PAGE_BYTES // 1000,
+    )
 
 
 def page_policy() -> str:

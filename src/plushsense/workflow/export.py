@@ -179,8 +179,8 @@ def export(
         given = replace(given, provenance=given.provenance | {"model_version": package.model_version})
     names = {"name": package.name, "url": package.url}
     done = emit(integer_model(given), given, Path(out), **names, also=also, windows=windows)
-    if done.no_page:
-        warn(done.no_page)
+    if done.page_note:
+        warn(done.page_note)
     return done
 
 

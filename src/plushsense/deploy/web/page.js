@@ -36,6 +36,9 @@ const LATVIAN = {
   "Simulated data are not recorded here, as the file could not say so: use plushsense record.": "Simulētus datus šeit neieraksta, jo datne to nevarētu pateikt: lietojiet plushsense record.",
   "No toy was chosen.": "Rotaļlieta nav izvēlēta.", "“{file}” is over.": "„{file}” ir beidzies.", "Playing “{file}”, a recording.": "Atskaņo „{file}”, ierakstu.", "Reading the toy.": "Nolasa rotaļlietu.",
   "“{file}” cannot be played: it is not a recording with the columns or lines of layout {layout}.": "„{file}” nevar atskaņot: tas nav ieraksts ar izkārtojuma {layout} slejām vai rindām.",
+  "“{file}” is packed (gzip or zip): unpack it, and play the file that is in it.": "„{file}” ir saspiests (gzip vai zip): izsaiņojiet to un atskaņojiet datni, kas tajā ir.",
+  "“{file}” is text in UTF-16: save it in UTF-8 with a text editor, and play that.": "„{file}” ir teksts UTF-16 kodējumā: ar teksta redaktoru saglabājiet to UTF-8 kodējumā un atskaņojiet to.",
+  "“{name}” is not a toy that this page can read, as it lacks the service of the Nordic UART: connect a toy that has it.": "„{name}” nav rotaļlieta, ko šī lapa var nolasīt, jo tajā nav Nordic UART pakalpojuma: savienojiet rotaļlietu, kurai tas ir.",
   "“{file}” is larger than {mb} MB; play a part of it.": "„{file}” ir lielāks par {mb} MB; atskaņojiet daļu no tā.",
   "This browser cannot run the model: {why}": "Šī pārlūkprogramma nevar darbināt modeli: {why}", "{n} frames": "{n} kadri",
   "At rest": "Miera stāvoklī", "Back stroke": "Muguras glāstīšana", "Ear scratch": "Ausu kasīšana", "Head stroke": "Galvas glāstīšana", "Hold in hands": "Turēšana rokās", "Hold strong": "Cieša apskaušana",
@@ -50,6 +53,7 @@ const named = (label) => (LATVIAN[label] ? t(label) : label.replace(/^(.*?)( \d+
 
 // Lines: devices/wire.LineParser ----------------------------------------------------------------------------------------
 const MOST = 2 ** 53, WHOLE = /^[+-]?\d{1,18}$/, DECIMAL = /^[+-]?(\d{1,18}(\.\d{0,18})?|\.\d{1,18})(e[+-]?\d{1,2})?$/i;
+const LATIN = new TextDecoder("latin1"); // any byte is one character
 const toEven = (x) => {
   const size = Math.abs(x), low = Math.floor(size), up = size - low > 0.5 || (size - low === 0.5 && low % 2 === 1);
   return Math.sign(x) * (low + up) + 0; // no negative zero
@@ -72,13 +76,8 @@ class LineParser {
 
   /** The frames that end within these bytes. */
   feed(bytes) {
-    let text = "";
-    for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
-    const pieces = text.split(/[\n\r]/), last = pieces.pop(), frames = [];
-    for (const piece of pieces) {
-      this.keep(piece);
-      frames.push(this.take());
-    }
+    const pieces = LATIN.decode(bytes).split(/[\n\r]/), last = pieces.pop();
+    const frames = pieces.map((piece) => { this.keep(piece); return this.take(); });
     this.keep(last);
     return frames.filter(Boolean);
   }
@@ -223,7 +222,7 @@ const ring = { s: new Float64Array(KEPT), y: channels.map(() => new Float64Array
 
 /** Begin a run; `source` has: close() and, for a file, its name. */
 async function begin(source) {
-  const toy = await open(image, await module);
+  const toy = await module.then((made) => open(image, made)).catch(async (cause) => { await source.close?.(); throw cause; });
   while (run && !run.over) await stop(); // another may have begun meanwhile
   const own = { source, toy, parser: new LineParser(true), reactor: new Reactor(), recent: [], follows: false, s: 0, ms: null, frames: 0, at: performance.now(), quiet: false, spans: [], log: [], eyes: "off", sound: "", until: 0 };
   toy.onEvent = (event) => change(own, event);
@@ -339,17 +338,26 @@ async function fromBluetooth() {
   const filters = [{ services: [UART] }, ...["Plush", "plush", "Toy", "toy", "Teddy", "teddy", "Bear", "bear"].map((namePrefix) => ({ namePrefix }))];
   const device = await navigator.bluetooth.requestDevice({ filters, optionalServices: [UART] });
   say("message", t("Connecting …"));
-  const tx = await (await (await device.gatt.connect()).getPrimaryService(UART)).getCharacteristic(TX);
+  const tx = await device.gatt.connect().then((server) => server.getPrimaryService(UART)).then((service) => service.getCharacteristic(TX)).catch((cause) => {
+    device.gatt.disconnect(); // or it stays connected, and other programs cannot find it
+    if (cause.name !== "NotFoundError") throw cause;
+  });
+  if (!tx) return say("message", t("“{name}” is not a toy that this page can read, as it lacks the service of the Nordic UART: connect a toy that has it.", device));
   const own = await begin({ close: () => device.gatt.disconnect() });
   device.addEventListener("gattserverdisconnected", () => own.over || gone(own, "disconnected"), { once: true });
   tx.addEventListener("characteristicvaluechanged", ({ target: { value } }) => feed(own, new Uint8Array(value.buffer, value.byteOffset, value.byteLength)));
   await tx.startNotifications().catch((cause) => gone(own, cause.message));
 }
 
+const PACKED = "“{file}” is packed (gzip or zip): unpack it, and play the file that is in it.", UTF_16 = "“{file}” is text in UTF-16: save it in UTF-8 with a text editor, and play that.";
+const WRONG = { 0x1f8b: PACKED, 0x504b: PACKED, 0xfffe: UTF_16, 0xfeff: UTF_16 }; // by the first two bytes
+
 /** Play a file at the pace of the toy's clock: devices/base.Pacer. */
 async function fromFile(chosen) {
   if (chosen.size > MOST_MB << 20) return say("message", t("“{file}” is larger than {mb} MB; play a part of it.", { file: chosen.name, mb: MOST_MB }));
-  const read = readFile(new Uint8Array(await chosen.arrayBuffer()), chosen.name);
+  const bytes = new Uint8Array(await chosen.arrayBuffer()), wrong = WRONG[bytes[0] << 8 | bytes[1]];
+  if (wrong) return say("message", t(wrong, { file: chosen.name }));
+  const read = readFile(bytes, chosen.name);
   if (!read) return say("message", t("“{file}” cannot be played: it is not a recording with the columns or lines of layout {layout}.", { file: chosen.name, layout: layout.name }));
   if (/simul|virtual/i.test(chosen.name)) $("simulated").checked = true;
   const own = await begin({ file: chosen.name }), { frames, malformed } = read;
@@ -419,9 +427,10 @@ function record() {
 // What is shown --------------------------------------------------------------------------------------------------------
 const SIGNS = { positive: "+", neutral: "○", negative: "−", none: "·" };
 const say = (id, text) => { if ($(id).textContent !== text) $(id).textContent = text; };
+const put = (id, name, value) => { if ($(id).getAttribute(name) !== value) $(id).setAttribute(name, value); };
 const make = (tag, text = "", values = {}) => Object.assign(document.createElement(tag), { textContent: text }, values);
-const LANE = 44, ink = {}, painted = new MessageChannel();
-let pen = null, frame = false, began = 0, cost = 0.4, textAt = 0, listed = false, drawn = 0, ranges = [], rangedAt = 0, spoken = null, speaking = 0, told = 0;
+const LANE = 44, ink = {}, shown = new MessageChannel();
+let pen = null, inSight = false, due = 0, cost = 0.4, pictures = 0, textAt = 0, listed = false, drawn = 0, ranges = [], rangedAt = 0, spoken = null, speaking = 0, told = 0;
 
 /** At most one sentence in 2.5 seconds, always the newest. */
 function speak(text) {
@@ -449,12 +458,12 @@ function showTexts() {
   const [state, about = "", affect] = situation(), own = run && !run.over ? run : null;
   say("state", t(state));
   say("about", state === "The toy cannot be read" ? t("The toy sends lines that cannot be read, as “{line}”: this page expects {n} whole or decimal numbers a line, at 115200 baud.", { line: own.parser.unread, n: own.parser.wire.length }) : t(about));
-  $("affect").hidden = !affect;
-  if (affect) { say("affect", `${SIGNS[affect]} ${t(affect)}`); $("affect").dataset.affect = affect; }
+  $("affect").toggleAttribute("hidden", !affect);
+  if (affect) { say("affect", `${SIGNS[affect]} ${t(affect)}`); put("affect", "data-affect", affect); }
   const eyes = own && own.s < own.until && !own.quiet ? own.eyes : "off", sound = eyes !== "off" && own.sound ? ` · ♪ ${t(own.sound)}` : "";
-  $("face").dataset.eyes = eyes;
+  put("face", "data-eyes", eyes);
   say("reaction", t(`Eyes ${eyes}`) + sound);
-  $("face").setAttribute("aria-label", `${t("Eyes of the toy")}: ${t(`Eyes ${eyes}`)}`);
+  put("face", "aria-label", `${t("Eyes of the toy")}: ${t(`Eyes ${eyes}`)}`);
   const shares = own ? run.toy.probabilities() : [];
   for (const [i, li] of [...$("bars").children].entries()) {
     const percent = own ? Math.round(100 * shares[i]) : null;
@@ -464,13 +473,13 @@ function showTexts() {
     li.lastChild.textContent = percent === null ? "–" : `${percent} %`;
   }
   if (rows) say("rows", t("{n} frames", { n: rows.length }));
-  if (run && ++told % 4 === 0) {
+  if (run && ++told % 2 === 0) {
     const n = run.toy.counts();
     say("counts", t("Frames: {frames}. Unreadable lines: {bad}. Invalid values: {invalid}. Gaps: {gaps}.", { frames: run.frames, bad: run.parser.malformed, invalid: n.invalid, gaps: n.restarts }));
   }
   const marks = [$("simulated").checked && "Simulation: these data say nothing about a real toy.", settings.simulated && "Simulation: this network was trained on virtual people. What it says about a real toy proves nothing."];
   say("mark", marks.filter(Boolean).map((text) => t(text)).join(" "));
-  $("mark").hidden = !$("mark").textContent;
+  $("mark").toggleAttribute("hidden", !$("mark").textContent);
   if (!listed) showEvents();
 }
 
@@ -487,28 +496,26 @@ function showEvents() {
 }
 
 /**
- * Draw with a next frame of the screen: the signals each time, texts four times a second and with each event. Frames follow each
- * other so that they take 3 % of a core: 60 a second with a graphics card, at least 20 without.
+ * Show what has come: signals in sight 20 to 60 times a second, as often as takes 1 % of a core here, a third of what it takes in all;
+ * texts twice a second and with each event. It is drawn as data arrive, and not with a frame of the screen: a canvas that is `desynchronized`
+ * needs none, and without a graphics card a frame takes three times as long.
  */
 function draw() {
-  if (frame) return;
-  frame = true;
-  const next = () => requestAnimationFrame((now) => {
-    [frame, began] = [false, performance.now()];
-    painted.port2.postMessage(0); // arrives when the browser is done with the frame
-    drawSignals(now);
-    if (listed && now - textAt < 250) return;
-    textAt = now;
-    showTexts();
-  });
-  cost > 0.5 ? setTimeout(next, Math.min(34, cost / 0.03 - 16)) : next();
+  const now = performance.now();
+  if (document.hidden || now < due) return;
+  due = Math.max(due, now - 15) + Math.min(Math.max(100 * cost, 16.6), 50);
+  drawSignals(now);
+  if (++pictures % 16 === 0) shown.port2.postMessage(now); // arrives when the browser is done with the picture
+  if (listed && now - textAt < 500) return;
+  textAt = now;
+  showTexts();
 }
-painted.port1.onmessage = () => (cost += (performance.now() - began - cost) / 16);
-setInterval(draw, 500); // what frames no longer change
+shown.port1.onmessage = ({ data: began }) => (cost += (performance.now() - began - cost) / 4);
+setInterval(draw, 500); // what data no longer change
 
 function redraw() {
   for (const name of ["back", "trace"]) ink[name] = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
-  [ranges, drawn, told, listed] = [[], 0, 3, false];
+  [ranges, drawn, told, listed, due] = [[], 0, 1, false, 0];
   draw();
 }
 
@@ -519,9 +526,10 @@ function drawSignals(now) {
     [canvas.width, canvas.height, drawn] = [Math.round(wide * ratio), Math.round(high * ratio), 0];
     canvas.style.height = `${high}px`;
   }
+  if (!inSight) return;
   if (ring.n && (!drawn || now - rangedAt > 1000)) setRanges(now);
   if (ring.n === drawn) return;
-  const c = (pen ??= canvas.getContext("2d", { alpha: false })), last = (ring.n - 1) % KEPT, x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
+  const c = (pen ??= canvas.getContext("2d", { alpha: false, desynchronized: true })), last = (ring.n - 1) % KEPT, x = (k) => ((ring.s[k % KEPT] % SHOWN_S) / SHOWN_S) * wide;
   let first = Math.max(0, ring.n - KEPT, drawn - 1);
   // All anew where the end of the picture or a gap is passed.
   if (!drawn || x(last) < x(first) || ring.s[last] - ring.s[first % KEPT] > 1) [drawn, first] = [0, Math.max(0, ring.n - KEPT)];
@@ -595,6 +603,9 @@ $("log").addEventListener("click", () => save(`plushsense-${$("mark").hidden ? "
   [["time", "t_s", "what", "number", "gesture", "affect", "source", "reaction"], ...run.log].map((cells) => cells.map(quoted).join(";"))));
 for (const node of document.querySelectorAll("[data-language]")) node.addEventListener("click", () => speakLanguage(node.dataset.language));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+// Nothing was drawn meanwhile.
+document.addEventListener("visibilitychange", redraw);
+new IntersectionObserver((all) => { inSight = all.at(-1).isIntersecting; redraw(); }).observe($("canvas"));
 addEventListener("resize", draw);
 say("model", settings.title);
 window.plushPage = { LineParser, readFile, named, t, get run() { return run; } };

@@ -12,19 +12,12 @@
  *
  * open(model, wasm?) -> Promise<Toy>; then, of a toy:
  *
- *     names, channels, id, title, layout, span, step   gestures, number of channels, CRC-32 of the image ...
- *     push(values, ms)         one reading; returns how many answers fell due, mostly 0 or 1
- *     answer()                 the newest answer, with the state of the toy
- *     events()                 changes of events since the last call, in order
- *     probabilities()          of each gesture, from 0 to 1 in steps of 1/255
- *     counts()                 restarts, invalid values, faults, interval between readings, what became of the newest
- *     prime(values, ms)        begin again from a reading at rest, without warming
- *     silence(), restart()     no reading came for a while; forget the past, as after a gap
- *     recalibrate()            other sensors, or the toy was off for long: sensors that calibrate themselves begin anew
- *     swap(model), patch(bytes or null)   another image for the same channels; the last layer of one person
- *     sensitivity              -128 to 127, 0: as trained
- *     onAnswer, onEvent        called with each, while push(), prime() and others run, which they cannot call themselves;
- *                              what they throw is reported as uncaught when the call is over, and the toy goes on
+ *     push(values, ms), prime(values, ms)                      readings
+ *     answer(), events(), probabilities(), counts()            what became of them
+ *     onAnswer, onEvent                                        functions to be called with each, see Toy
+ *     silence(), restart(), recalibrate()                      no reading came, a gap, other sensors
+ *     swap(model), patch(bytes or null), sensitivity           another model, that of one person
+ *     names, channels, id, title, layout, span, step, bytes    what is known of the model
  *
  * A gap in the stamps needs no call: the toy is warming again by itself (counts().restarts). All times are milliseconds
  * of the toy's own clock, which wraps after 2^32. What cannot be done throws a PlushError with one sentence.
@@ -119,13 +112,21 @@ export async function open(model, wasm) {
   return toy;
 }
 
+/** A value of any kind in a sentence. */
+const spelt = (value) => typeof value + (Object(value) === value ? "" : ` “${String(value).slice(0, 40)}”`);
+
 async function besideThis() {
   const file = new URL("plushsense.wasm", import.meta.url);
   if (file.protocol !== "file:") return (await fetch(file)).arrayBuffer();
   return (await import("node:fs/promises")).readFile(file);
 }
 
-/** A stream of one toy; `open` makes it. */
+/**
+ * A stream of one toy; `open` makes it.
+ *
+ * onAnswer and onEvent are called while push(), prime() and others run, which they cannot call themselves; what they throw is
+ * reported as uncaught when the call is over, and the toy goes on.
+ */
 export class Toy {
   constructor(c) {
     this._c = c;
@@ -143,12 +144,15 @@ export class Toy {
     this._toy = this._room("toy", c.plush_toy_bytes());
     const image = this._put("model", model);
     const memory = this._memory(image);
-    const status = c.plush_web_bind(this._toy, image.at, image.bytes, memory.at, memory.bytes);
-    if (status) throw new PlushError(PROBLEMS[status] ?? "", status);
+    this._done(c.plush_web_bind(this._toy, image.at, image.bytes, memory.at, memory.bytes));
     /** @type {number} values of one reading */
     this.channels = c.plush_channels(this._toy);
     this._values = this._room("values", 4 * this.channels);
     this._model();
+  }
+
+  _done(status) {
+    if (status) throw new PlushError(PROBLEMS[status] ?? "", status);
   }
 
   /** What is known of the model that runs. */
@@ -159,6 +163,7 @@ export class Toy {
     /** @type {string[]} of the gestures */
     this.names = Array.from({ length: classes }, (_, n) => this._text(c.plush_gesture_name(this._toy, n)));
     this.title = this._text(c.plush_model_title(this._toy));
+    /** @type {number} CRC-32 of the image */
     this.id = c.plush_model_id(this._toy) >>> 0;
     const [, span, layout, step] = this._all();
     /** @type {number} samples that the network looks back */
@@ -205,13 +210,13 @@ export class Toy {
     return new TextDecoder().decode(bytes.subarray(0, bytes.indexOf(0)));
   }
 
-  _read(n) {
-    return new Int32Array(this._c.memory.buffer, this._numbers, n);
+  _read(n, Kind = Uint32Array) {
+    return Array.from(new Kind(this._c.memory.buffer, this._numbers, n));
   }
 
   _all() {
     this._c.plush_web_numbers(this._toy, this._numbers);
-    return Array.from(this._read(5 + 2 * this.names.length));
+    return this._read(5 + 2 * this.names.length, Int32Array);
   }
 
   /** An answer (0) or a change of an event, in the midst of a step, out of which no error must lead. */
@@ -228,17 +233,9 @@ export class Toy {
   _tell(what) {
     if (what === 0) return this.onAnswer?.(this.answer());
     this._c.plush_read_event(this._toy, this._numbers);
-    const [kind, number, affect, gesture, source, since, ms] = this._read(7);
-    const event = {
-      what: WHATS[kind],
-      number: number >>> 0,
-      affect: AFFECTS[affect],
-      gesture: gesture === NO_GESTURE ? null : gesture,
-      name: gesture === NO_GESTURE ? null : this.names[gesture],
-      source: SOURCES[source],
-      since_ms: since >>> 0,
-      ms: ms >>> 0,
-    };
+    const [kind, number, affect, index, source, since_ms, ms] = this._read(7);
+    const gesture = index === NO_GESTURE ? null : index, name = gesture === null ? null : this.names[gesture];
+    const event = { what: WHATS[kind], number, affect: AFFECTS[affect], gesture, name, source: SOURCES[source], since_ms, ms };
     if (this._events.push(event) > MOST_EVENTS) this._events.shift();
     this.onEvent?.(event);
   }
@@ -249,12 +246,14 @@ export class Toy {
 
   _reading(values, ms) {
     this._settled();
-    if (!Number.isFinite(ms)) throw new PlushError(`The time of a reading is a number of milliseconds by the clock of the toy, and not ${String(ms)}.`);
+    if (!Number.isFinite(ms)) throw new PlushError(`The time of a reading is a number of milliseconds by the clock of the toy, and not ${spelt(ms)}.`);
     if (values?.length !== this.channels)
       throw new PlushError(`A reading of this toy has ${this.channels} values, one for each channel, and not ${values?.length ?? 0}.`);
     const to = new Int32Array(this._c.memory.buffer, this._values, this.channels);
     for (let i = 0; i < to.length; i++) {
-      const value = Math.round(values[i] ?? NaN);
+      const given = values[i] ?? NaN;
+      if (typeof given !== "number") throw new PlushError(`A value of a reading is a number, or null for a sensor that gave none, and not ${spelt(given)}.`);
+      const value = Math.round(given);
       to[i] = Number.isNaN(value) ? NO_READING : Math.min(Math.max(value, NO_READING), 2 ** 31 - 1);
     }
     return this._values;
@@ -271,35 +270,26 @@ export class Toy {
     return this._c.plush_push(this._toy, ms, this._reading(values, ms));
   }
 
-  /** @param {ArrayLike<number>} values a reading at rest @param {number} ms @returns {boolean} whether it was taken */
+  /** Begin again from a reading, without warming. @param {ArrayLike<number>} values a reading at rest @param {number} ms @returns {boolean} whether it was taken */
   prime(values, ms) {
     return this._c.plush_prime(this._toy, ms, this._reading(values, ms)) !== 0;
   }
 
-  /** @returns {Answer} */
+  /** The newest answer, with the state of the toy. @returns {Answer} */
   answer() {
     const [sample] = this._all();
     this._c.plush_read_answer(this._toy, this._numbers);
     const [ms, state, affect, kind, gesture, confidence, known] = this._read(7);
-    return {
-      ms: ms >>> 0,
-      sample: sample >>> 0,
-      state: STATES[state],
-      kind: KINDS[kind],
-      affect: AFFECTS[affect],
-      gesture,
-      name: this.names[gesture],
-      confidence: confidence / 32768,
-      known,
-    };
+    const sure = { kind: KINDS[kind], affect: AFFECTS[affect], gesture, name: this.names[gesture] };
+    return { ms, sample: sample >>> 0, state: STATES[state], ...sure, confidence: confidence / 32768, known: known | 0 };
   }
 
-  /** @returns {Event[]} */
+  /** Changes of events since the last call, in order. @returns {Event[]} */
   events() {
     return this._events.splice(0);
   }
 
-  /** @returns {number[]} */
+  /** Of each gesture, from 0 to 1 in steps of 1/255. @returns {number[]} */
   probabilities() {
     return this.names.map((_, n) => this._c.plush_probability(this._toy, n) / 255);
   }
@@ -313,19 +303,9 @@ export class Toy {
   /** @returns {Counts} */
   counts() {
     this._c.plush_read_counts(this._toy, this._numbers);
-    const n = Array.from(this._read(10), (value) => value >>> 0);
-    return {
-      answers: n[0],
-      restarts: n[1],
-      invalid: n[2],
-      faults: n[3],
-      bad_stamps: n[4],
-      interpolated: n[5],
-      interval: n[6],
-      sparse: n[7] !== 0,
-      suspect: n[8] !== 0,
-      reading: READINGS[n[9]],
-    };
+    const [answers, restarts, invalid, faults, bad_stamps, interpolated, interval, sparse, suspect, reading] = this._read(10);
+    const numbers = { answers, restarts, invalid, faults, bad_stamps, interpolated, interval };
+    return { ...numbers, sparse: sparse !== 0, suspect: suspect !== 0, reading: READINGS[reading] };
   }
 
   /** @returns {number} bytes of the module's memory, which does not grow while a toy runs */
@@ -333,11 +313,13 @@ export class Toy {
     return this._c.memory.buffer.byteLength;
   }
 
+  /** No reading came for a while. */
   silence() {
     this._settled();
     this._c.plush_silence(this._toy);
   }
 
+  /** Forget the past, as after a gap. */
   restart() {
     this._settled();
     this._c.plush_restart(this._toy);
@@ -348,12 +330,14 @@ export class Toy {
     this._c.plush_recalibrate?.(this._toy); // which only the module for such sensors has
   }
 
+  /** A whole number from -128 to 127; 0: as trained. @type {number} */
   get sensitivity() {
     return this._all()[4];
   }
 
   set sensitivity(steps) {
-    this._c.plush_set_sensitivity(this._toy, steps);
+    if (!Number.isInteger(steps)) throw new PlushError(`The sensitivity is a whole number from -128 to 127, and not ${spelt(steps)}.`);
+    this._c.plush_set_sensitivity(this._toy, Math.min(Math.max(steps, -128), 127));
   }
 
   /** Run another model for the same channels; unless it can, the old one goes on. @param {Uint8Array|ArrayBuffer} model */
@@ -361,8 +345,7 @@ export class Toy {
     const other = this._other ? "model" : "other";
     const image = this._put(other, model);
     const memory = this._memory(image);
-    const status = this._c.plush_swap(this._toy, image.at, image.bytes, memory.at, memory.bytes);
-    if (status) throw new PlushError(PROBLEMS[status] ?? "", status);
+    this._done(this._c.plush_swap(this._toy, image.at, image.bytes, memory.at, memory.bytes));
     this._other = !this._other;
     this._model();
   }
@@ -371,8 +354,7 @@ export class Toy {
   patch(bytes) {
     const next = this._patched ? "patch" : "patch too";
     const patch = bytes === null ? { at: 0, bytes: 0 } : this._put(next, bytes);
-    const status = this._c.plush_patch(this._toy, patch.at, patch.bytes);
-    if (status) throw new PlushError(PROBLEMS[status] ?? "", status);
+    this._done(this._c.plush_patch(this._toy, patch.at, patch.bytes));
     if (bytes !== null) this._patched = !this._patched;
   }
 }
