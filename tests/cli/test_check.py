@@ -16,7 +16,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import format_header, format_rows, read_recording
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.marks import read_marks
-from plushsense.workflow import datasets
+from plushsense.workflow.advice import unused_advice
 
 Cli = Callable[..., Any]
 ACCEL = load_layout("accel-3")
@@ -189,18 +189,13 @@ def test_a_simulation_says_so_whatever_simulated_it(cli: Cli, folder: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_training_says_once_which_advice_is_not_used(
-    cli: Cli, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_says_once_which_advice_is_not_used(cli: Cli, folder: Path, tmp_path: Path) -> None:
     given = ("train", folder, "--epochs", "1", "--arch", "4", "--filters", "2", "--window-s", "1.5", "--force")
     ran = cli(*given, "--out", tmp_path / "m.plush")
     assert ps.load(tmp_path / "m.plush").windowing["window_s"] == 1.5
     (line,) = (line for line in ran.err.splitlines() if line.startswith("not used: "))
     assert f"check marks 2 recordings: to leave them out, try  check {folder} --exclude clock-reset: --why" in line
-    with monkeypatch.context() as patch:
-        patch.setattr(datasets, "check", None)  # the files are not read again
-        assert datasets.unused_advice(folder) == [line.removeprefix("not used: ").rpartition(";")[0]]
     cli("check", folder, "--accept", f"clock-reset:{ids(folder)[0]}", "--why", "the toy fell")
-    assert "check marks 1 recording:" in datasets.unused_advice(folder)[0]
+    assert "check marks 1 recording:" in unused_advice(folder, 1.5)[0].text
     cli("check", folder, "--exclude", "clock-reset:", "--why", "it restarted")
     assert "not used" not in cli(*given, "--out", tmp_path / "m.plush").err

@@ -72,8 +72,8 @@ def test_a_network_has_the_score_of_its_evaluation(home: Path) -> None:
     assert results.details(after).by_gesture == results.details(proof).by_gesture
     # An evaluation of other settings, or of other data, says nothing about it.
     table = json.loads((folder / SCORES).read_text(encoding="utf-8"))
-    # Without streams, it has the context "loop", though "anywhere" was asked for, as for the network.
-    (folder / SCORES).write_text(json.dumps(table | {"train_context": "loop", "context": "loop"}), encoding="utf-8")
+    # Without streams, it has the context "rest", though "anywhere" was asked for, as for the network.
+    (folder / SCORES).write_text(json.dumps(table | {"train_context": "rest", "context": "rest"}), encoding="utf-8")
     assert results.networks()[little].proof == folder
     other = {**table["config"], "evaluation": {"train_context": "loop"}}
     for change in ({"config": other}, {"dataset": {"name": "virtual toy", "hash": "ab"}}, {"leaky": True}):

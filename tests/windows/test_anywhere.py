@@ -163,7 +163,7 @@ def test_without_a_stream_recordings_are_cut_as_ever_and_marked(tmp_path: Path) 
     write_recording(ben / recording_filename("Wave", 5, 80), ramp(0, 80), ACCEL)
     data = made(tmp_path)
     w = cut_anywhere(data, SPEC, data.gestures, EVERY)
-    assert set(w.context[w.subject == "ben"]) == {"loop"}
+    assert set(w.context[w.subject == "ben"]) == {"rest"}
     assert w.context[w.y == 1].tolist() == ["loop"], "row 10 has no second of past"
 
 

@@ -103,6 +103,15 @@ def test_too_little_past_or_a_gap_falls_back_to_a_marked_loop(dataset: Dataset) 
     assert sorted(w.integers[:, 0, 0].tolist()) == [100, 1550]
 
 
+def test_without_a_stream_the_default_is_rest(dataset: Dataset) -> None:
+    w, held = (
+        cut_windows(dataset, WindowSpec(context=context), dataset.gestures.subset(["Wave"]))
+        for context in ("stream", "rest")
+    )
+    assert w.context[w.subject == "ben"].tolist() == ["rest"]
+    assert np.array_equal(w.integers[w.subject == "ben"], held.integers[held.subject == "ben"])
+
+
 def test_a_longer_span_reaches_further_back(dataset: Dataset) -> None:
     w = cut_windows(dataset, WindowSpec(context="stream", span_s=4.99), dataset.gestures.subset(["Wave"]))
     real = w.take(np.flatnonzero(w.context == "stream"))

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
+    from plushsense.workflow.advice import measure_advice
     from plushsense.workflow.api import FoldsSpec, evaluate_run
     from plushsense.workflow.learning import check_sizes, measure_curve, save_curve
-    from plushsense.workflow.preparation import prepare
+    from plushsense.workflow.preparation import prepare, require_people_left_out
     from plushsense.workflow.reporting import PAGE, write_report
 
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
@@ -35,6 +36,8 @@ def run(args: argparse.Namespace) -> int:
     dataset = open_dataset(args.dataset)
     made = prepare(dataset, config, warn)
     most = check_sizes(made, args.people) if args.people else 0
+    if args.advice:
+        require_people_left_out(made, "--advice")
     out = Path(args.out) if args.out else dataset.path / "evaluations" / made.name
     spec = FoldsSpec(out, args.force, args.cluster, args.int8)
     result = evaluate_run(made, spec, progress=report_jobs("evaluating"), warn=warn)
@@ -46,10 +49,16 @@ def run(args: argparse.Namespace) -> int:
         else:
             content["learning"] = curve.to_json()
             save_curve(curve, made, out)
+    if args.advice:
+        bar = report_jobs("advice")
+        found = measure_advice(dataset, config, result, args.cluster, bar, warn)
+        content["advice"] = [advice.to_json() for advice in found]
+        if not found:
+            say("everything that is advised is used")
     content["report"] = str(write_report(out / PAGE, dataset, [out]))
     say(f"written: {out}")
     emit(args, content, lines(content))
-    say_advice(args.dataset)
+    say_advice(args.dataset, config.windows.window_s)
     return 0
 
 

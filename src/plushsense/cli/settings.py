@@ -62,12 +62,18 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
     )
 
 
-def say_advice(dataset: str) -> None:
-    """Say on standard error, in one line, what would change the scores and is not used."""
-    from plushsense.workflow.datasets import unused_advice
+def say_advice(dataset: str, window_s: float) -> None:
+    """Say on standard error, in one line, what would change the scores and is not used, with what it brings if known.
 
-    if advice := unused_advice(dataset, ProgressReporter("checking")):
-        say(f"not used: {'; '.join(advice)}; an evaluation with it says what it brings")
+    A run with long windows warns of them, so that a window is named only where its gain was measured.
+    """
+    from plushsense.dataset.importing.proposals import WINDOW
+    from plushsense.workflow.advice import unused_advice
+
+    advice = unused_advice(dataset, window_s, ProgressReporter("checking"))
+    if texts := [f"{a.text} ({a.gain.text})" if a.gain else a.text for a in advice if a.gain or a.kind != WINDOW]:
+        unmeasured = any(a.gain is None and a.kind != WINDOW for a in advice)
+        say(f"not used: {'; '.join(texts)}" + "; evaluate --advice measures what it brings" * unmeasured)
 
 
 def report_epochs(title: str = "training") -> EpochProgress:

@@ -23,9 +23,10 @@ def run(args: argparse.Namespace) -> int:
 
     if check_bundle_path(args.out).exists() and not args.force:
         raise ConfigError(f"'{args.out}' is already there: choose another --out, or replace it with --force.")
+    config = settings(args)
     done = train(
         args.dataset,
-        settings(args),
+        config,
         **options(args, "quantize_aware", "temperature", "fit_decisions"),
         journal=unfinished(args.dataset),
         progress=report_epochs(),
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
             *decided(done.bundle.decision),
         ],
     )
-    say_advice(args.dataset)
+    say_advice(args.dataset, config.windows.window_s)
     return 0
 
 

@@ -388,6 +388,11 @@ class Dataset:
         chosen = set(people)
         return self._copy(self.head, [r for r in self.recordings if r.subject in chosen])
 
+    def without(self, recordings: Iterable[str]) -> Dataset:
+        """Return this data set with some recordings, given by their ids, excluded as by a mark."""
+        chosen = set(recordings)
+        return self._copy(self.head, [replace(r, excluded=r.excluded or r.id in chosen) for r in self.recordings])
+
     def without_stretches(self) -> Dataset:
         """Return this data set without the labels of `stretches`, as if no stream had any."""
         other = self._copy(self.head, self.recordings)

@@ -8,7 +8,7 @@ Every figure of a result is one of these two, and is called *mean* or *pooled*.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,6 +52,11 @@ class Predictions:
         """The class with the highest probability, (N,)."""
         best: NDArray[np.int64] = np.argmax(self.probabilities, axis=1).astype(np.int64)
         return best
+
+    def of_recordings(self, recordings: NDArray[np.str_]) -> Predictions:
+        """Return the predictions for some recordings, given by their ids."""
+        kept = np.isin(self.recording, recordings)
+        return replace(self, **{name: value[kept] for name, value in vars(self).items() if name != "labels"})
 
 
 def gather_predictions(

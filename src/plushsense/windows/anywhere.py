@@ -133,8 +133,9 @@ def cut_anywhere(
         progress: called with (streams done, total number of streams).
 
     Returns:
-        Windows with the ``context`` "anywhere" ("loop" or "inside" for recordings without a stream). The idle windows
-        of a stream form one recording of the stream's person; no window contains a gap or reset of the clock.
+        Windows with the ``context`` "anywhere"; those of recordings without a stream, or with too little of it before
+        them, are cut as by the context "stream". The idle windows of a stream form one recording of the stream's
+        person; no window contains a gap or reset of the clock.
 
     Raises:
         DatasetError: if there is no window.

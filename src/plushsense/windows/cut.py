@@ -3,10 +3,10 @@
 A recording that is at least one window long gives full windows every ``step_s`` from its start ("inside"). A shorter
 one gives a single window, whose remaining samples depend on the ``context``:
 
-- ``stream``: they are the samples before the recording in the session's stream. If there is no stream, or it has too
-  few samples, the recording is looped, and the window is marked as such.
-- ``loop``: the recording is repeated from its start, as in the paper (never zero-padded).
+- ``stream``: they are the samples before the recording in the session's stream. If there is no stream, the window is
+  cut and marked as with ``rest``; if the stream has too few samples there, as with ``loop``.
 - ``rest``: its first reading stands before it, as if the toy had been still.
+- ``loop``: the recording is repeated from its start, as in the paper (never zero-padded).
 - ``rows``: as with ``loop``, but the rows of the recording are taken as even samples, whatever their times, as the
   authors' scripts do. No recording is left out for its length.
 
@@ -47,10 +47,10 @@ class WindowSpec:
         window_s: length of the windows (above 0 to 60).
         step_s: time from the start of a window to that of the next one in the same recording (above 0 to 60).
         context: where the samples come from that a recording shorter than a window lacks. ``stream``: from the
-            session before the recording; ``rest``: its first reading, as if the toy had been still; ``loop``: the
-            recording is repeated; ``rows``: the same, and its rows are taken as even samples whatever their times, as
-            by the authors' scripts; ``anywhere``: for live use, windows are cut all along the sessions, also while
-            nothing happens (one of `TRAIN_CONTEXTS`; default: by the preset).
+            session before the recording, or as ``rest`` without a stream; ``rest``: its first reading, as if the toy
+            had been still; ``loop``: the recording is repeated; ``rows``: the same, and its rows are taken as even
+            samples whatever their times, as by the authors' scripts; ``anywhere``: for live use, windows are cut all
+            along the sessions, also while nothing happens (one of `TRAIN_CONTEXTS`; default: by the preset).
         span_s: Not in a file: it follows from the network. It lengthens windows for networks that need more samples.
         longest_factor: recordings longer than this many times the median of their gesture are left out; 0: none is
             (0 or from 1).
@@ -93,8 +93,8 @@ class WindowSet:
     ``subject`` (N,): code of the person, "none" if nobody; ``context`` (N,): "inside" (wholly in its recording),
     "stream" (begins before it in the stream), "rest", "loop", "rows" or "anywhere"; ``stream`` (N,): id of the stream
     of the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
-    recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes of one
-    vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
+    recording cover, −1 if unknown (always for "rest", "loop" and "rows"). ``vectors``: triples of inputs that are the
+    axes of one vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
     ``self_calibration``: "causal" if sensors calibrate themselves (`plushsense.windows.sessions`), else "".
     """
 
@@ -236,7 +236,9 @@ class RecordingCutter:
             cuts = [replace(cut, context=ROWS) for cut in cuts]
         if not cuts and self._spec.context != ROWS:
             segments = self._sessions.recording(recording)
-            cuts = from_recording(segments, self._dataset, self.reach, self._step, self._spec.context == REST)
+            # Where a stream begins too late or has a gap, rest was no better (docs/measurements/people.md).
+            rest = self._spec.context == REST or (self._spec.context != "loop" and recording.stream_row < 0)
+            cuts = from_recording(segments, self._dataset, self.reach, self._step, rest)
         if not cuts:
             still = recording.id in self._sessions.standing
             template = "{recording}: its clock stands still" if still else "{recording}: no valid sample"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import os
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -15,11 +14,8 @@ from filelock import FileLock
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.sentences import Message, plural
-from plushsense.core.version import __version__
 from plushsense.dataset.files import change_head
-from plushsense.dataset.importing.proposals import WINDOW, propose_settings
 from plushsense.dataset.index import as_dataset
-from plushsense.dataset.marks import read_marks
 from plushsense.dataset.publishing.checking import StageProgress
 from plushsense.dataset.publishing.contents import ContentsSpec, person_codes, public_codes, public_labels
 from plushsense.dataset.publishing.keys import open_key
@@ -39,8 +35,6 @@ from plushsense.dataset.quality.checking import CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, Progress
 from plushsense.evaluation.reidentification import reidentify, report, verdict
-from plushsense.jobs.journal import job_id, keep_if_possible
-from plushsense.workflow.reporting import journal_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -160,29 +154,6 @@ def decide(
     if marked:
         dataset = as_dataset(dataset.path)
     return check_dataset(dataset, only=only, limits=limits, progress=progress), len(marked)
-
-
-def unused_advice(dataset: Dataset | str | os.PathLike[str], progress: Progress | None = None) -> list[str]:
-    """Return what `check` and the import advise but the data set does not follow, each with the command that does.
-
-    The window is left out: whoever trains is warned of it. The checks read every file, so that the result is kept in
-    the cache of the data set.
-    """
-    dataset = as_dataset(dataset)
-    journal = journal_of(dataset, "advice")
-    accepted = sorted((about, *sorted(mark.accepted)) for about, mark in read_marks(dataset.path).items())
-    job = job_id({"version": __version__, "data": dataset.hash, "accepted": accepted})
-    kept = journal.find(job)
-    if kept is None:
-        errors = [f for f in check(dataset, progress=progress).undecided if f.recording]
-        options = " ".join(f"--exclude {name}:" for name in Counter(f.check for f in errors))
-        marked = plural(len({f.recording for f in errors}), "recording")
-        advice = [f"{p.reason}: {p.advice}" for p in propose_settings(dataset) if p.key != WINDOW]
-        if errors:
-            advice.append(f'check marks {marked}: to leave them out, try  check {dataset.path} {options} --why "..."')
-        kept = {"advice": advice}
-        keep_if_possible(journal, job, kept)
-    return list(kept["advice"])
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from plushsense.evaluation.crossval import EvaluationResult, fold_windows, train
 from plushsense.jobs.progress import JobProgress
 from plushsense.scoring.metrics import summary
 from plushsense.workflow.api import FoldsSpec, evaluate_run
-from plushsense.workflow.preparation import Run, silent
+from plushsense.workflow.preparation import Run, require_people_left_out, silent
 from plushsense.workflow.reporting import LEARNING
 
 MORE_PEOPLE = 3
@@ -106,12 +106,7 @@ def check_sizes(run: Run, sizes: Sequence[int]) -> int:
     Raises:
         ConfigError: for a split that does not leave people out, or ``sizes`` that its folds do not have.
     """
-    if not run.split.separates_people:
-        raise ConfigError(
-            "A learning curve over people needs a split that leaves people out, and '{split}' does not: use "
-            "leave-one-subject-out or by-subject:K.",
-            split=run.split.text,
-        )
+    require_people_left_out(run, "--people")
     most = trained_people(run)
     if not 1 <= min(sizes) < most or max(sizes) > most:
         raise ConfigError(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.layouts import Layout
 from plushsense.core.sentences import Message
@@ -231,6 +231,17 @@ def prepare(dataset: Dataset | str | os.PathLike[str], config: RunConfig, warn: 
     )
 
 
+def require_people_left_out(run: Run, option: str) -> None:
+    """Raise ConfigError if the split of a run does not leave people out, which ``option`` needs."""
+    if not run.split.separates_people:
+        raise ConfigError(
+            "{option} needs a split that leaves people out, and '{split}' does not: use leave-one-subject-out or "
+            "by-subject:K.",
+            option=option,
+            split=run.split.text,
+        )
+
+
 def named_classes(dataset: Dataset, choice: str | Sequence[str]) -> tuple[Dataset, str | tuple[str, ...]]:
     """Return the data set and the classes; for merged gestures (`GestureSet.merged_by`), the data set has these.
 
@@ -303,15 +314,6 @@ def windows_for(
     for line in cut.left_out:
         warn(Message("left out: {line}", line=line))
     warn_of_far_readings(cut, warn)
-    if spec.context == "stream" and 2 * (looped := int((cut.context == "loop").sum())) > len(cut):
-        warn(
-            Message(
-                "{n} of {of} windows repeat their gesture, as no stream tells what came before it: --context rest puts "
-                "its first reading there, with which networks read real streams better",
-                n=looped,
-                of=len(cut),
-            )
-        )
     # Cells that nothing touches are constant without a fault.
     if not any(c.is_discrete for c in dataset.layout.channels) and (note := constant_windows(cut)) is not None:
         warn(note)

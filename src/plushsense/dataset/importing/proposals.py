@@ -59,6 +59,7 @@ _LEAST_SESSIONS = 3
 _TOUCH = 0.9  # quantile of the distances from rest
 
 SELF_CALIBRATION, WINDOW = "self_calibration", "window_s"
+BY_LAYOUT = "give a layout with {settings}, or import anew with --adopt"
 
 Floats = NDArray[np.float64]
 Sphere = tuple[Floats, float]
@@ -182,7 +183,7 @@ class Proposal:
             return f"try  --window-s {self.value:g}  of train and evaluate"
         if self.adopted:
             return f"adopted {self.setting}"
-        return f"give a layout with {self.setting}, or import anew with --adopt"
+        return BY_LAYOUT.format(settings=self.setting)
 
     def to_json(self) -> dict[str, object]:
         """Return plain values for JSON; ``groups`` only if there are any."""

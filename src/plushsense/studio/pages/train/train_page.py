@@ -246,9 +246,12 @@ class TrainingForm:
                 with self._facts:
                     tag(notice(text), "recorded-once")
             if not facts.streams and self._values[TRAIN]["context"] == ANYWHERE:
-                self._values[TRAIN]["context"] = "loop"
+                self._values[TRAIN]["context"] = "rest"
                 self._build()
-                none = w("This data set has no continuous sessions, so the network learns from repeated gestures.")
+                none = w(
+                    "This data set has no continuous sessions, so the network learns gestures as if"
+                    " the toy had been still before."
+                )
                 with self._facts:
                     ui.label(none).classes("ps-dim")
 
