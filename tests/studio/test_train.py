@@ -124,7 +124,7 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     done = state(page, "done")
     verdict = done.locator('[data-test="score"]').inner_text()
     assert re.fullmatch(
-        r"It reads about [\d.]+ of 10 touches of people it never met; guessing gives 0.6 of 10.", verdict
+        r"It reads about [\d.]+ of 10 touches of one person it never met; guessing gives 0.6 of 10.", verdict
     )
     # The curve ends at the figure of the sentence, which stands in the table, too.
     (figure,) = re.findall(r"^Accuracy ([\d.]+), macro-F1", done.locator('[data-test="result"]').inner_text())
