@@ -16,8 +16,11 @@ from plushsense.core.toml import builtin_names, load_table, read_named
 AFFECTS = ("positive", "neutral", "negative", "none")
 NOBODY = "none"
 FAMILY, AFFECT = "family", "affect"
-IDLE_LABELS = frozenset({"at rest", "idle", "no gesture", "no touch", "nothing", "rest"})
-"""Labels, in the form of `plain_label`, of recordings in which nothing happens, where no gesture set says more."""
+IDLE_LABELS = frozenset({"at rest", "idle", "no gesture", "no touch", "nothing"})
+"""Labels, in the form of `plain_label`, of recordings in which nothing happens, where no gesture set says more.
+
+``rest`` is not among them: a hand may rest on a toy.
+"""
 
 
 def plain_label(label: str) -> str:
