@@ -247,6 +247,22 @@ def test_a_training_goes_on_as_if_it_had_never_stopped(made: Make, tmp_path: Pat
         fit(train, made(20, seed=4), arch(padding=padding), replace(spec, patience=3), store=StoreSpec(state))
 
 
+def test_a_training_can_begin_with_given_weights(made: Make) -> None:
+    first = fit(made(60), None, arch(), SPEC)
+    still = replace(SPEC, epochs=1, learning_rate=1e-9)
+    further = fit(made(90, seed=4), None, arch(), still, store=StoreSpec(initial=first.weights))
+    anew = fit(made(90, seed=4), None, arch(), still)
+    learned = [name for name in first.weights if not name.endswith(("mean", "var"))]
+    assert all(np.allclose(further.weights[name], first.weights[name], atol=1e-6) for name in learned)
+    assert not all(np.allclose(anew.weights[name], first.weights[name], atol=1e-6) for name in learned)
+    assert further.history[0]["train_loss"] < anew.history[0]["train_loss"]
+
+
+def test_a_training_on_more_people_takes_a_third_of_the_epochs() -> None:
+    whole, short = TrainSpec(epochs=60, halve_every=15).continued(), TrainSpec(epochs=1, halve_every=None).continued()
+    assert (whole.epochs, whole.halve_every, short.epochs, short.halve_every) == (20, 5, 1, None)
+
+
 @pytest.mark.parametrize("stop_on", ["loss", "accuracy"])
 def test_a_training_that_stops_early_goes_on_as_well(made: Make, tmp_path: Path, stop_on: str) -> None:
     spec = replace(SPEC, epochs=40, learning_rate=0.05, patience=3, stop_on=stop_on)

@@ -45,12 +45,12 @@ def test_train_learns_from_everybody_once_scores_and_decisions_are_found(
 ) -> None:
     rows: list[dict[str, Any]] = []
     trained = ps.train(dataset, epochs=2, filters=(4, 4, 4), progress=lambda *at: rows.append(at[2]))
-    monkeypatch.setattr("plushsense.workflow.preparation.refits", lambda *_: False)
+    monkeypatch.setattr("plushsense.workflow.preparation.refit_epochs", lambda *_: 0)
     held_back = ps.train(dataset, epochs=2, filters=(4, 4, 4))
     origin, before = trained.bundle.provenance, held_back.bundle.provenance
     assert (origin["subjects"], origin["refit"], before["refit"]) == (sorted(dataset.subjects), True, False)
     assert origin["validation_subjects"] == before["validation_subjects"] != []
-    assert [row.get("what") for row in rows] == [None, None, REFIT, REFIT]
+    assert [row.get("what") for row in rows] == [None, None, REFIT]
     assert trained.scores.accuracy == held_back.scores.accuracy
     assert trained.bundle.decision == held_back.bundle.decision and trained.history == held_back.history
     assert any(not np.array_equal(w, held_back.bundle.weights[k]) for k, w in trained.bundle.weights.items())

@@ -46,7 +46,7 @@ def test_a_plan_uses_the_time_for_folds_and_the_learning_curve_first() -> None:
 def test_a_training_as_long_as_estimated_cuts_no_folds(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cost = TrainingCost(window_epoch_s=1e-3, windows=100, networks=2)
+    cost = TrainingCost(window_epoch_s=1e-3, windows=100, networks=4 / 3)
     plan = choose_plan(cost, len(dataset.subjects), 2, 600)
     done = SimpleNamespace(seconds=cost.training_s(2), bundle=SimpleNamespace(to_bytes=lambda: b""))
     done.save = lambda path: path

@@ -41,7 +41,7 @@ def test_a_stopped_training_ends_in_the_same_file(
 
         return progress
 
-    # With the preset "people", first in the training without the people held back, then in that on everybody.
+    # With the preset "people", first in the training without the people held back, then in the third on everybody.
     trainings = 2 if preset == "people" else 1
     for last in (2, 8) if trainings == 2 else (2, 4):
         told.clear()
@@ -56,7 +56,8 @@ def test_a_stopped_training_ends_in_the_same_file(
     told.clear()
     torch.manual_seed(99)
     done = ps.train(dataset, journal=journal, progress=until(0), **settings)
-    assert told == trainings * list(range(1, len(whole.history) + 1)), "epochs of before are told, then the others"
+    further = [1, 2] if trainings == 2 else []
+    assert told == [*range(1, len(whole.history) + 1), *further], "epochs of before are told, then the others"
     assert done.history == whole.history
     assert done.bundle.to_bytes() == whole.bundle.to_bytes()
     assert done.seconds > 0

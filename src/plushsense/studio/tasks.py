@@ -53,7 +53,7 @@ from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dat
 from plushsense.workflow.export import export
 from plushsense.workflow.forgetting import forget_everywhere
 from plushsense.workflow.networks import REFIT
-from plushsense.workflow.preparation import count_people, refits
+from plushsense.workflow.preparation import count_people, refit_epochs
 from plushsense.workflow.project import open_project, save_project
 from plushsense.workflow.reporting import check_folder, load_evaluation
 
@@ -378,17 +378,18 @@ def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
     clock, tuning, epochs = Clock(), int(spec.get("quantize_aware", 0)), config.training.epochs
-    each, again = epochs + tuning, refits(config, count_people(open_dataset(spec["dataset"])))
+    again = refit_epochs(config, count_people(open_dataset(spec["dataset"])))
+    whole = epochs + tuning + (again + tuning if again else 0)
 
     def epoch(at: int, of: int, row: EpochRow) -> None:
         what = str(row.get("what", ""))
         second, part = what.startswith(REFIT), what.removeprefix(REFIT).lstrip(", ")
-        past = epochs if part else 0
+        past = (epochs + tuning if second else 0) + ((again if second else epochs) if part else 0)
         stage = "refitting" if second else "fine-tuning" if part else "training"
         scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "accuracy")}
-        share = (each * second + past + at) / (each * (1 + again))
+        share = (past + at) / whole
         reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(share))
-        if at == of and second == again and not tuning:
+        if at == of and second == (again > 0) and not tuning:
             reporter.progress(stage="deciding", epoch=at, epochs=of, share=1.0)
 
     done = train(

@@ -62,7 +62,7 @@ class FittedNetwork:
 
 @dataclass(frozen=True)
 class StoreSpec:
-    """What of a training is stored, and the state that it continues from.
+    """What of a training is stored, and what it begins with.
 
     Attributes:
         start: state to continue from, with the same windows and settings but more epochs; the result is bit for bit
@@ -70,12 +70,14 @@ class StoreSpec:
         keep: epochs after which a copy of the weights is stored. With a constant learning rate, these equal the weights
             of trainings with fewer epochs.
         save: called with the state every ``save_every_s`` seconds.
+        initial: weights to begin with, as of the same network trained on fewer people; None: drawn by the seed.
     """
 
     start: FitState | None = None
     keep: Collection[int] = ()
     save: Callable[[FitState], None] | None = None
     save_every_s: float = 60.0
+    initial: Weights | None = None
 
 
 def fit(
@@ -111,7 +113,7 @@ def fit(
     with torch.random.fork_rng(devices=[]), repeatable(allow_tf32=True), torch_threads(threads):
         channels = Channels(train.vectors, scaler, device, arch.vector is not None)
         most = len(train) if weights is None else int(np.ceil(weights.sum()))
-        training = _Training(arch, spec, channels, most, val_data is not None, store.start)
+        training = _Training(arch, spec, channels, most, val_data is not None, store)
         with closing(training.net):
             for epoch in range(len(training.history) + 1, spec.epochs + 1):
                 rate = spec.learning_rate_at(epoch)
@@ -147,23 +149,23 @@ class _Training:
     Args:
         most: largest number of windows in an epoch.
         validated: whether there are windows for early stopping.
-        start: state to continue from.
+        store: weights or state to begin with.
     """
 
     def __init__(
-        self, arch: Arch, spec: TrainSpec, channels: Channels, most: int, validated: bool, start: FitState | None
+        self, arch: Arch, spec: TrainSpec, channels: Channels, most: int, validated: bool, store: StoreSpec
     ) -> None:
-        self._spec, self._stops = spec, validated and spec.patience is not None
+        self._spec, self._stops, start = spec, validated and spec.patience is not None, store.start
         if start is not None and self._stops and not start.best:
             raise TrainingError(
                 "A training with early stopping cannot go on from a state that holds no best weights: leave patience "
                 "out."
             )
         torch.manual_seed(spec.seed)
-        initial = Net(arch)
-        if start is not None:
-            initial.import_weights(start.weights)
-        self.net = engine(arch, initial, channels.device, min(spec.batch, most), spec.threads)
+        net = Net(arch)
+        if (weights := store.initial if start is None else start.weights) is not None:
+            net.import_weights(weights)
+        self.net = engine(arch, net, channels.device, min(spec.batch, most), spec.threads)
         self._order = torch.Generator().manual_seed(spec.seed)
         self._augment = augmentations(spec.augment, channels)
         self._adam = Adam(self.net.parameters, fused=True, weight_decay=spec.weight_decay, decayed=self.net.decayed)

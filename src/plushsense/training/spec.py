@@ -89,6 +89,11 @@ class TrainSpec:
         halvings = 0 if self.halve_every is None else (epoch - 1) // self.halve_every
         return self.learning_rate * 0.5**halvings
 
+    def continued(self) -> TrainSpec:
+        """Return the schedule of a training that begins with the weights of an earlier one: a third of the epochs."""
+        every = self.halve_every
+        return replace(self, epochs=-(-self.epochs // 3), halve_every=None if every is None else -(-every // 3))
+
     def changed(self, **changes: Any) -> TrainSpec:
         """Return a copy with some settings changed; ``turn_deg=45`` stands for ``augment=["random-rotation:45"]``."""
         if "turn_deg" in changes:

@@ -50,7 +50,7 @@ from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
 from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.networks import KEPT_S, REFIT, NetworkTrainer, TrainedNetwork
+from plushsense.workflow.networks import KEPT_S, NetworkTrainer, TrainedNetwork
 from plushsense.workflow.preparation import (
     WHOLE_PEOPLE,
     PreparedTraining,
@@ -209,9 +209,9 @@ def train(
     """Train one network on a data set.
 
     15 % of the people, chosen by the seed, are held out for validation: the network is scored on them, and the decision
-    settings are fitted. Then it is trained again in the same way, on everybody, and this network is returned; so the
-    scores are those of a network of fewer people. With early stopping, the validation people determine when to stop,
-    so that the scores are slightly too high, and there is no second training. `evaluate` scores all people.
+    settings are fitted. Then it is trained further on everybody, for a third of the epochs, and this network is
+    returned; so the scores are those of a network of fewer people. With early stopping, the validation people determine
+    when to stop, so that the scores are slightly too high, and nothing follows. `evaluate` scores all people.
     The preset ``search`` splits windows as the paper does (70/15/15), which is leaky and marked as such.
     ``context="anywhere"`` trains for live use (see `windows.anywhere`): idleness is a class; scored are whole gestures.
 
@@ -241,7 +241,7 @@ def train(
     trainer = NetworkTrainer(run, made.windows, made.kind == WHOLE_PEOPLE, quantize_aware, temperature, journal, report)
     checked = trainer.train(made.train, scored.take(made.validation), made.fold.subjects)
     nothing, everything = scored.take(made.validation[:0]), np.arange(len(made.windows))
-    final = trainer.train(everything, nothing, what=REFIT) if made.refit else checked
+    final = trainer.train(everything, nothing, start=checked) if made.refit else checked
     predictions, scores = _validated(made, checked, warn)
     bundle = _bundle(made, final, scores, quantize_aware, temperature)
     if fit_decisions:

@@ -31,7 +31,7 @@ from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.learning import LearningCurve, accuracies, learning_curve, save_curve
 from plushsense.workflow.networks import REFIT
-from plushsense.workflow.preparation import Run, Warn, count_people, prepare, refits, silent
+from plushsense.workflow.preparation import Run, Warn, count_people, prepare, refit_epochs, silent
 from plushsense.workflow.reporting import PAGE, check_folder, journal_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -56,14 +56,14 @@ class TrainingCost:
         window_epoch_s: seconds to train on one window for one epoch.
         windows: number of windows of all people.
         side_by_side: number of folds that are trained at the same time.
-        networks: number of trainings that the final network takes: 2 if people are first held out for its decision
-            settings, else 1.
+        networks: number of trainings that the final network takes: more than 1 if people are first held out for its
+            decision settings.
     """
 
     window_epoch_s: float
     windows: int
     side_by_side: int = 1
-    networks: int = 1
+    networks: float = 1.0
 
     def training_s(self, epochs: int) -> float:
         """Return the seconds to train the final network."""
@@ -220,7 +220,7 @@ class _Making:
         self._began = time.monotonic()
         self._dataset, self._out, self._config = dataset, out, config
         self._budget_s, self._progress, self._warn = budget_s, progress, warn
-        self._again = refits(config, count_people(dataset))
+        self._again = refit_epochs(config, count_people(dataset)) / config.training.epochs
         # A resumed run must not choose other folds because the computer is faster or slower than before.
         self._journal = journal_of(dataset, "budgets")
         self._key = job_id({"evaluation": prepare(dataset, config).id, "out": out.name, "seconds": budget_s})
@@ -274,9 +274,10 @@ class _Making:
 
         def epoch_done(epoch: int, epochs: int, row: EpochRow) -> None:
             second = str(row.get("what", "")).startswith(REFIT)
-            share = (epoch / epochs + second) / whole
+            done = 1.0 + again * epoch / epochs if second else epoch / epochs
+            share = done / whole
             progress(BudgetProgress(TRAINING, share, {**row, "epoch": epoch, "epochs": epochs}))
-            if epoch == epochs and second == again:
+            if epoch == epochs and second == (again > 0):
                 progress(BudgetProgress(DECIDING, share, {}))
 
         config, dataset = _planned(self._config, plan), self._dataset
@@ -311,7 +312,7 @@ class _Making:
         return learning_curve(points)
 
 
-def _measured(dataset: Dataset, config: RunConfig, networks: int) -> TrainingCost:
+def _measured(dataset: Dataset, config: RunConfig, networks: float) -> TrainingCost:
     split = "leave-one-subject-out" if count_people(dataset) >= _PEOPLE_FOR_SPLIT else _KNOWN_PEOPLE
     seen = preview_evaluation(dataset, replace(config, evaluation=replace(config.evaluation, split=split)))
     return TrainingCost(seen.window_epoch_s, seen.windows, config.evaluation.processes, networks)

@@ -63,7 +63,8 @@ def preview_training(
 ) -> CostEstimate:
     """Return what `api.train` would train on and its cost."""
     made = prepare_training(dataset, config, warn)
-    trained = len(made.train) + (len(made.windows) if made.refit else 0)
+    again = made.run.training.continued().epochs / made.run.training.epochs if made.refit else 0.0
+    trained = len(made.train) + round(again * len(made.windows))
     return _estimate(made.run, made.windows, trained, (made.kind, made.split.leaky, made.run.windows.context, 1))
 
 

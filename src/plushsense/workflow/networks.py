@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from plushsense.deploy.quantize import calibration
 from plushsense.evaluation.crossval import windows_fingerprint
 from plushsense.jobs.journal import Journal, job_id, keep_if_possible
 from plushsense.models.reference import divide_logits
-from plushsense.training.spec import EpochProgress, EpochRow
+from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.preparation import Run, outside_streams
 
@@ -68,18 +69,24 @@ class NetworkTrainer:
     _stored: list[str] = field(default_factory=list)
 
     def train(
-        self, at: NDArray[np.int64], watched: WindowSet, others: Sequence[str] = (), what: str = ""
+        self,
+        at: NDArray[np.int64],
+        watched: WindowSet,
+        others: Sequence[str] = (),
+        start: TrainedNetwork | None = None,
     ) -> TrainedNetwork:
         """Train one network.
 
         Args:
             at: indices of its windows; watched: windows for validation; others: people who are left out.
-            what: describes the network in the rows of ``progress``.
+            start: network to train further (see `TrainSpec.continued`); the rows of ``progress`` then have `REFIT`.
         """
         from plushsense.training.engine import FitState
         from plushsense.training.fit import StoreSpec, fit
 
-        spec, network, journal, began = self.run.training, self.run.network, self.journal, time.monotonic()
+        network, journal, began = self.run.network, self.journal, time.monotonic()
+        spec = self.run.training if start is None else self.run.training.continued()
+        initial, what = (None, "") if start is None else (start.fitted.weights, REFIT)
 
         def epoch_done(epoch: int, epochs: int, row: EpochRow) -> None:
             whole = ", ".join(name for name in (what, row.get("what")) if name)
@@ -89,9 +96,9 @@ class NetworkTrainer:
             # Decisions are fitted on whole streams of the others, which may contain recordings at rest.
             at = at[outside_streams(self.windows, self.run.dataset, others)[at]]
         train_on = self.windows.take(at)
-        store, before_s = StoreSpec(), 0.0
+        store, before_s = StoreSpec(initial=initial), 0.0
         if journal is not None:
-            job = self._job(train_on, watched)
+            job = self._job(train_on, watched, spec, initial)
             journal.prune(KEPT_S)
             self._stored.append(job)
             entry = journal.find(job) or {}
@@ -101,10 +108,10 @@ class NetworkTrainer:
                 seconds = before_s + time.monotonic() - began
                 keep_if_possible(journal, job, {**state.to_arrays(), "seconds": seconds})
 
-            start = FitState.from_arrays(entry) if entry else None
-            for row in start.history if start is not None else ():
+            state = FitState.from_arrays(entry) if entry else None
+            for row in state.history if state is not None else ():
                 epoch_done(row["epoch"], spec.epochs, row)
-            store = StoreSpec(start, save=save, save_every_s=_SAVE_EVERY_S)
+            store = StoreSpec(state, save=save, save_every_s=_SAVE_EVERY_S, initial=initial)
         fitted = fit(train_on, watched, network, spec, epoch_done, store)
         weights = fitted.weights
         ranges = calibration(network, weights, fitted.scaler, self.windows.integers[at])
@@ -115,10 +122,14 @@ class NetworkTrainer:
         weights = divide_logits(weights, self.temperature)
         return TrainedNetwork(at, fitted, weights, ranges, fitted.seconds + before_s, self.quantize_aware > 0)
 
-    def _job(self, train: WindowSet, watched: WindowSet) -> str:
+    def _job(
+        self, train: WindowSet, watched: WindowSet, spec: TrainSpec, initial: dict[str, NDArray[np.float32]] | None
+    ) -> str:
         from plushsense.training.fit import resolve_device
 
-        settings = {"arch": self.run.network.to_dict(), "training": resolve_device(self.run.training).key()}
+        settings: dict[str, Any] = {"arch": self.run.network.to_dict(), "training": resolve_device(spec).key()}
+        if initial is not None:
+            settings["initial"] = hashlib.sha256(b"".join(w.tobytes() for w in initial.values())).hexdigest()
         fingerprints = [windows_fingerprint(train), windows_fingerprint(watched)]
         return job_id({"what": "training", **settings, "vectors": train.vectors, "windows": fingerprints})
 

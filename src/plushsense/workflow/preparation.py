@@ -450,12 +450,14 @@ def count_people(dataset: Dataset) -> int:
     return len({r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT})
 
 
-def refits(config: RunConfig | Run, people: int) -> bool:
-    """Return whether `api.train` trains a second time, on everybody: where whole people are held out for nothing else.
+def refit_epochs(config: RunConfig | Run, people: int) -> int:
+    """Return for how many epochs `api.train` trains further on everybody; 0 if it does not.
 
-    With early stopping, the people who are held out determine when to stop.
+    It does where whole people are held out for nothing else: with early stopping, they determine when to stop.
     """
-    return people >= _FEWEST_APART and config.training.patience is None and config.preset != "search"
+    spec = config.training
+    apart = people >= _FEWEST_APART and spec.patience is None and config.preset != "search"
+    return spec.continued().epochs if apart else 0
 
 
 @dataclass(frozen=True)
@@ -467,8 +469,7 @@ class PreparedTraining:
         scored: windows of the same recordings, perhaps cut with other settings; those of validation are at the indices
             ``validation``, and at ``fold.test`` those that the network is scored on.
         kind: `WHOLE_PEOPLE`, "validation-recordings" or the name of the leaky split; ``description`` as a sentence.
-        refit: whether a second network, which is the one to keep, is trained on everybody in the same way after the
-            first was scored.
+        refit: whether the network is trained further on everybody after it was scored.
     """
 
     run: Run
@@ -502,7 +503,7 @@ def prepare_training(
     if run.scored_on != run.trained_on:
         scored = run.scored_windows()
     people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
-    refit = refits(run, len(people))
+    refit = refit_epochs(run, len(people)) > 0
     stops = "" if run.training.patience is None else " but decided when to stop"
     groups = round(1 / VALIDATION_SHARE)
     if run.preset == "search":
@@ -513,7 +514,7 @@ def prepare_training(
         split = parse_split(f"by-subject:{min(len(people), groups)}")
         kind, description = WHOLE_PEOPLE, f"people who were not trained on{stops}: "
         if refit:
-            description = "people who were held back from the first of two trainings: "
+            description = "people who were held back from the first part of the training: "
     else:
         split = parse_split(f"by-recording:{max(2, min(len(np.unique(windows.recording)) // 2, groups))}")
         kind = "validation-recordings"
