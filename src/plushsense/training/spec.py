@@ -89,10 +89,15 @@ class TrainSpec:
         halvings = 0 if self.halve_every is None else (epoch - 1) // self.halve_every
         return self.learning_rate * 0.5**halvings
 
+    def with_epochs(self, epochs: int) -> TrainSpec:
+        """Return a copy with other epochs, in which the learning rate falls in the same proportion."""
+        every = self.halve_every
+        scaled = None if every is None else max(1, round(every * epochs / self.epochs))
+        return replace(self, epochs=epochs, halve_every=scaled)
+
     def continued(self) -> TrainSpec:
         """Return the schedule of a training that begins with the weights of an earlier one: a third of the epochs."""
-        every = self.halve_every
-        return replace(self, epochs=-(-self.epochs // 3), halve_every=None if every is None else -(-every // 3))
+        return self.with_epochs(-(-self.epochs // 3))
 
     def changed(self, **changes: Any) -> TrainSpec:
         """Return a copy with some settings changed; ``turn_deg=45`` stands for ``augment=["random-rotation:45"]``."""

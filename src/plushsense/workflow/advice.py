@@ -37,7 +37,7 @@ RECORDINGS, LAYOUT = "recordings", "layout"
 
 @dataclass(frozen=True)
 class AdviceGain:
-    """What an advice brings: mean accuracy of the people with it minus that without it.
+    """Gain from following a piece of advice: the accuracy with it minus that without it, averaged over people.
 
     The accuracy is that of the votes by recording, over the recordings that both evaluations score. ``ci95`` is over
     ``people``, ``p`` of a paired permutation test; ``split``, ``epochs`` and ``seed`` are those of both evaluations.

@@ -248,15 +248,19 @@ def train(
         reader = replace(bundle, weights=checked.weights, scaler=checked.fitted.scaler)
         bundle = replace(bundle, decision=_decisions(reader, dataset, run.live, warn))
     if made.kind == WHOLE_PEOPLE:
-        kept = journal_of(dataset, _PREDICTIONS)
-        kept.prune(KEPT_S)
-        keep_if_possible(kept, _predictions_id(bundle), {**vars(predictions)})
+        _keep_predictions(dataset, bundle, predictions)
     trainer.discard()
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
-    history = with_accuracy(checked.fitted.history, apart)
     seconds = checked.seconds + (final.seconds if made.refit else 0.0)
-    return Trained(bundle, history, scores, seconds, dataset.generation)
+    return Trained(bundle, with_accuracy(checked.fitted.history, apart), scores, seconds, dataset.generation)
+
+
+def _keep_predictions(dataset: Dataset, bundle: Bundle, predictions: Predictions) -> None:
+    """Store the answers on the people who were held back in the cache of the data set, for `validation_predictions`."""
+    kept = journal_of(dataset, _PREDICTIONS)
+    kept.prune(KEPT_S)
+    keep_if_possible(kept, _predictions_id(bundle), {**vars(predictions)})
 
 
 def _bundle(

@@ -322,9 +322,7 @@ def _planned(config: RunConfig, plan: BudgetPlan) -> RunConfig:
     """Return the settings with the split and the epochs of the plan; the learning rate falls in the same proportion."""
     training = config.training
     if plan.epochs < plan.usual_epochs:
-        every = training.halve_every
-        shorter = None if every is None else max(1, round(every * plan.epochs / plan.usual_epochs))
-        training = replace(training, epochs=plan.epochs, halve_every=shorter)
+        training = training.with_epochs(plan.epochs)
     workers = plan.workers or config.evaluation.workers
     evaluation = replace(config.evaluation, split=plan.split, workers=workers)
     return replace(config, training=training, evaluation=evaluation)

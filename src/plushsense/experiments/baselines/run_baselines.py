@@ -246,8 +246,7 @@ def baselines(
             data, an error is raised unless ``overwrite``.
     """
     spec, dataset = spec or ComparisonSpec(), as_dataset(dataset)
-    given = from_settings(config, **settings)
-    if given.windows.context == ANYWHERE:
+    if (given := from_settings(config, **settings)).windows.context == ANYWHERE:
         raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
     run = prepare(dataset, given, warn)
     inputs, dataset, identity = dataset.layout.inputs, run.dataset, comparison_id(run, spec)

@@ -179,9 +179,7 @@ def recipes_for(dataset: Dataset, run: Run, networks: Collection[str], warn: War
     if ANYWHERE in networks:
         gestures = classes_for(dataset, classes, "anywhere", warn if WINDOWS not in networks else silent)
         arch = replace(run.network, classes=len(gestures))
-        halved = replace(training, epochs=-(-training.epochs // 2))
-        if training.halve_every:
-            halved = replace(halved, halve_every=-(-training.halve_every // 2))
+        halved = training.with_epochs(-(-training.epochs // 2))
         recipes[ANYWHERE] = Recipe(arch, halved, replace(run.windows, context="anywhere"), gestures, run.anywhere)
     return recipes
 
