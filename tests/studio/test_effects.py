@@ -47,3 +47,20 @@ def test_the_effect_of_a_click_is_in_sight(studio: Fixture, look: Fixture, few: 
     assert in_sight(phone, "work")
     assert axe(phone) == []
     assert browser.complaints == []
+
+
+def test_the_page_does_not_move_under_a_pressed_button(studio: Fixture, look: Fixture, home: Path) -> None:
+    server, browser = studio(home=home), look()
+    page = browser.open(f"{server.url}/train")
+    marked(page, "facts").get_by_text("Simulation:").wait_for()
+    more = marked(page, "more")
+    more.hover()
+    page.mouse.down()
+    marked(page, "make").press("Enter")
+    marked(page, "job").get_by_text("testing on people left out").wait_for(timeout=LONG_MS)
+    page.mouse.up()
+    assert in_sight(page, "job"), "as soon as the button is released"
+    marked(page, "start").wait_for()
+    marked(page, "stop").click()
+    page.locator("[data-state=stopped]").wait_for(timeout=LONG_MS)
+    assert browser.complaints == []

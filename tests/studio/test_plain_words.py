@@ -9,7 +9,7 @@ from typing import Any
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.live.event_log import log_csv
 from plushsense.studio.pages.live.live_state import EventSpan
-from support.browsing import LONG_MS, axe, connected, marked
+from support.browsing import LONG_MS, axe, connected, in_sight, marked
 from support.recording_pages import begun
 
 Fixture = Callable[..., Any]
@@ -50,8 +50,9 @@ def test_no_heading_or_field_has_the_name_of_another(studio: Fixture, look: Fixt
     connected(page)
     assert page.get_by_role("region", name="Results", exact=True).count() == 1
     # Two trainings at once on two cores take twice as long: a question first.
+    marked(page, "facts").get_by_text("Simulation:").wait_for()
     marked(page, "make").click()
-    marked(page, "stop").wait_for()
+    assert in_sight(page, "job")
     marked(page, "more").click()
     marked(page, "start").click()
     marked(page, "ask").get_by_text("two jobs at once").wait_for()

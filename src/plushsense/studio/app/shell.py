@@ -522,7 +522,10 @@ def focus(element: ui.element) -> None:
 
 
 def reveal(element: ui.element) -> None:
-    """Scroll to the effect of a click as soon as it is displayed, and move the keyboard focus there."""
-    at = f"const at = getHtmlElement({element.id})"
-    go = "if (at) { at.tabIndex = -1; at.focus({ preventScroll: true }); at.scrollIntoView(); }"
-    ui.run_javascript(f"setTimeout(() => {{ {at}; {go} }}, {_DRAWN_MS})")
+    """Scroll to the effect of a click as soon as it is displayed, and move the keyboard focus there.
+
+    A page that moves under a pressed button loses that click, so the page is moved after the button is released.
+    """
+    go = "at.tabIndex = -1; at.focus({ preventScroll: true }); at.scrollIntoView();"
+    wait = f"const at = getHtmlElement({element.id}); if (document.querySelector(':active')) later(); else if (at)"
+    ui.run_javascript(f"const later = () => setTimeout(() => {{ {wait} {{ {go} }} }}, {_DRAWN_MS}); later()")
