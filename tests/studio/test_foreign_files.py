@@ -140,6 +140,18 @@ def test_a_label_in_a_column_a_single_file_and_damaged_ones(studio: Fixture, loo
     marked(page, "mapping-right").click()
     keep(page, "one")
     assert open_dataset(home / "datasets" / "one").subjects == ["S09"]
+    # A folder of Parquet, whose files have one name: person and gesture are in the path.
+    pl = pytest.importorskip("polars")
+    for seed, (who, what) in enumerate((p, g) for p in ("A", "B") for g in ("hug", "poke") for _ in range(3)):
+        place = tmp_path / "columns" / who / f"{what}_{seed}"
+        place.mkdir(parents=True)
+        values = [(7 * k + seed) % 11 for k in range(100)]
+        pl.DataFrame({"t_ms": [20 * k for k in range(100)], "alpha": values}).write_parquet(place / "data.parquet")
+    bring(page, tmp_path / "columns", button="choose_folder")
+    rows.get_by_text("columns/A/hug_0/data.parquet").first.wait_for(timeout=LONG_MS)
+    marked(page, "mapping-right").click()
+    keep(page, "columns")
+    assert len(open_dataset(home / "datasets" / "columns").recordings) == 12
     # What cannot be read is one sentence.
     (tmp_path / "noise.csv").write_bytes(bytes(range(256)) * 9)
     (tmp_path / "prose.csv").write_text("Dear diary,\nnothing happened\n")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import tomllib
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, FileFormatError
 from plushsense.dataset.importing import guessing
 from plushsense.dataset.importing.guessing import GuessedPattern, guess_pattern
 from plushsense.dataset.importing.importers import preview_import
@@ -438,3 +439,54 @@ def test_numbers_of_columns_are_no_row(tmp_path: Path, head: str) -> None:
     first = [noise(60, k)[0] for k in range(3)]
     assert list(seen.rows[0].values.values()) == pytest.approx(first)
     assert not any("no line of column names" in doubt for doubt in guess.doubts)
+
+
+def test_parquet_is_guessed_as_the_same_text_is(tmp_path: Path) -> None:
+    pl = pytest.importorskip("polars")
+    for seed, (person, gesture, take) in enumerate((p, g, t) for p in "ABC" for g in GESTURES for t in (1, 2)):
+        touches(tmp_path / "text" / person / f"{gesture}_{take}.csv", seed)
+        (tmp_path / "src" / person).mkdir(parents=True, exist_ok=True)
+        text = pl.read_csv(tmp_path / "text" / person / f"{gesture}_{take}.csv")
+        text.write_parquet(tmp_path / "src" / person / f"{gesture}_{take}.parquet")
+    found, _, seen = guessed(tmp_path / "src")
+    (tmp_path / "guess.toml").unlink()
+    of_text, _, seen_text = guessed(tmp_path / "text")
+    assert found.pop("paths") == ["{subject}/{label}_{recording}.parquet"]
+    assert of_text.pop("paths") == ["{subject}/{label}_{recording}.csv"]
+    found["layout"]["name"] = of_text["layout"]["name"]
+    assert found == of_text
+    assert (
+        (seen.subjects, seen.gestures)
+        == (seen_text.subjects, seen_text.gestures)
+        == (list("ABC"), {"hug": 6, "tap": 6})
+    )
+
+
+def test_parquet_may_hold_dates_and_lists_and_pictures(tmp_path: Path) -> None:
+    pl = pytest.importorskip("polars")
+    (tmp_path / "src").mkdir()
+    rows, lists = [], []
+    for take in range(9):
+        person, gesture = ("ann", "bob", "cy")[take % 3], GESTURES[take % 2]
+        x = [None if k == 5 else value for k, value in enumerate(noise(60, take))]
+        at = [datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=10 * take + 0.02 * k) for k in range(60)]
+        rows += [{"when": w, "who": person, "gesture": gesture, "x": v} for w, v in zip(at, x, strict=True)]
+        lists.append({"who": person, "gesture": gesture, "x": x, "picture": b"\x89PNG", "made": {"by": "hand"}})
+    pl.DataFrame(rows).with_columns(pl.col("gesture").cast(pl.Categorical)).write_parquet(
+        tmp_path / "src" / "all.parquet"
+    )
+    found, guess, seen = guessed(tmp_path / "src")
+    assert found["time_unit"] == "iso" and found["columns"] == {"subject": "who", "time": "when"}
+    assert names(found) == ["x"] and found["layout"]["rate_hz"] == 50.0
+    assert (seen.recordings, seen.subjects) == (9, ["ann", "bob", "cy"])
+    # One row for each recording, as data sets of Hugging Face have them.
+    (tmp_path / "guess.toml").unlink()
+    (tmp_path / "src" / "all.parquet").unlink()
+    pl.DataFrame(lists).write_parquet(tmp_path / "src" / "train.parquet")
+    found, guess, seen = guessed(tmp_path / "src")
+    assert names(found) == ["x"] and found["row_rate_hz"] == 50.0
+    assert (seen.recordings, seen.subjects) == (9, ["ann", "bob", "cy"])
+    assert any("no clock" in doubt for doubt in guess.doubts)
+    (tmp_path / "src" / "train.parquet").write_bytes((tmp_path / "src" / "train.parquet").read_bytes()[:200])
+    with pytest.raises(FileFormatError, match=r"'train.parquet' cannot be read as Parquet"):
+        guess_pattern(tmp_path / "src")

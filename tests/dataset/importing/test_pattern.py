@@ -122,7 +122,7 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="recordings of the GestureRecorder: import it without a pattern"):
         guess_pattern(src)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetError, match="holds no text file"):
+    with pytest.raises(DatasetError, match="holds no table: a pattern"):
         guess_pattern(tmp_path / "empty")
     with pytest.raises(DatasetError, match="There is no"):
         guess_pattern(tmp_path / "none")

@@ -49,11 +49,13 @@ from plushsense.dataset.importing.pattern import (
 from plushsense.dataset.importing.sources import folder_name, source_files, split_regular_files
 from plushsense.dataset.importing.table_files import (
     is_between,
+    is_parquet,
     is_text,
     json_cells,
     json_objects,
     number_blocks,
     one_recording_each,
+    parquet_objects,
 )
 
 _FILES, _LINES, _FEW = 12, 2000, 5
@@ -111,7 +113,7 @@ def guess_pattern(
         limits: limits of unpacking a zip.
 
     Raises:
-        DatasetError: for a folder without text files.
+        DatasetError: for a folder without tables.
     """
     source, given = Path(source), given or GuessSpec()
     if not source.exists():
@@ -132,10 +134,10 @@ def guess_pattern(
 
 def _tables(source: Path, found: Iterable[Path], given: GuessSpec) -> tuple[list[Path], list[Path], int, str]:
     """Return the tables with the ending of most bytes, all files with it, the number of others, and the ending."""
-    files = [f for f in split_regular_files(found)[0] if not f.name.startswith(".") and _is_text(f)]
+    files = [f for f in split_regular_files(found)[0] if not f.name.startswith(".") and _is_table(f)]
     if not files:
         raise DatasetError(
-            "'{source}' holds no text file: a pattern is guessed from tables of text and JSON lines.", source=source
+            "'{source}' holds no table: a pattern is guessed from text, JSON and Parquet.", source=source
         )
     sizes: Counter[str] = Counter()
     for file in files:
@@ -169,13 +171,16 @@ def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> Gue
     guess = PatternDraft(given=given)
     if others:
         guess.doubt("files that do not end in '{ending}' are left out: {n}", "files", ending=ending, n=others)
-    guess.is_json = ENDINGS.get(ending) == "json" or _text(some[0], None, _HEAD).lstrip()[:1] in ("{", "[")
-    if guess.is_json:
-        columns = _json_columns([_json_text(f, guess) for f in some], guess)
+    form = _format(some[0], ending)
+    guess.is_json = form != "csv"
+    if form == "parquet":
+        columns = _json_columns([parquet_objects(f, _LINES) for f in some], guess)
+    elif guess.is_json:
+        columns = _json_columns([json_objects(_json_text(f, guess)) for f in some], guess)
     else:
         columns = _text_columns([lines for f in some if (lines := _text(f, guess).splitlines()[:_LINES])], guess)
-    if guess.is_json and ENDINGS.get(ending) != "json":
-        guess.keys["format"] = "json"
+    if guess.is_json and ENDINGS.get(ending) != form:
+        guess.keys["format"] = form
     if not guess.is_json:
         mine = [f for f in mine if _fits(_text(f, None, _HEAD).splitlines(), guess)] or mine
     without = sorted(set(of_ending) - set(mine))
@@ -239,10 +244,18 @@ def _paths(base: Path, mine: list[Path], without: list[Path], ending: str, guess
     return parts
 
 
-def _is_text(path: Path) -> bool:
+def _is_table(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(4096)
-    return bool(head.strip()) and b"\x00" not in head and path.suffix.lower() not in (".md", ".toml", ".py", ".pdf")
+    is_text = b"\x00" not in head and path.suffix.lower() not in (".md", ".toml", ".py", ".pdf")
+    return bool(head.strip()) and (is_text or is_parquet(path))
+
+
+def _format(path: Path, ending: str) -> str:
+    """Return the format of a table, as `ImportPattern.format_of` names it: csv, json or parquet."""
+    if is_parquet(path):
+        return "parquet"
+    return "json" if ENDINGS.get(ending) == "json" or _text(path, None, _HEAD).lstrip()[:1] in ("{", "[") else "csv"
 
 
 def _is_recorded(path: Path) -> bool:
@@ -259,7 +272,9 @@ def _is_recorded(path: Path) -> bool:
 
 
 def _has_rows(path: Path) -> bool:
-    """Return whether the first lines of a file hold a row with a number, or a JSON value."""
+    """Return whether a file is Parquet, or its first lines hold a row with a number, or a JSON value."""
+    if is_parquet(path):
+        return True
     with path.open("rb") as file:
         lines = file.read(4096).decode("utf-8-sig", "replace").splitlines()
     return any(line.lstrip()[:1] in ("{", "[") or any(map(is_number, re.split(r"[,;\t| ]", line))) for line in lines)
@@ -426,13 +441,12 @@ def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:
     return csv.reader((line for line in lines if line.strip()), delimiter=separator)
 
 
-def _json_columns(samples: list[str], guess: PatternDraft) -> list[SampledColumn]:
+def _json_columns(samples: list[list[tuple[int, Any]]], guess: PatternDraft) -> list[SampledColumn]:
     """Return the values of JSON objects as columns, by their path within an object."""
     cells: dict[str, list[list[str]]] = {}
     lists: set[str] = set()
     objects = recordings = 0
-    for text in samples:
-        whole = json_objects(text)
+    for whole in samples:
         each = one_recording_each(whole)
         objects, recordings = objects + len(whole), recordings + len(each)
         for key, (parts, in_list) in json_cells(each).items():

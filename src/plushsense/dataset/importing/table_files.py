@@ -542,16 +542,55 @@ def _cell(value: Any, at: int) -> str:
     return "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
 
 
+@contextlib.contextmanager
+def _parquet_errors(name: str) -> Iterator[None]:
+    """Raise FileFormatError for what polars raises when it cannot read the Parquet file ``name``."""
+    try:
+        yield
+    except FileFormatError:
+        raise
+    except BaseException as cause:
+        # A panic of polars on damaged bytes is a BaseException but no Exception.
+        if not isinstance(cause, Exception) and type(cause).__name__ != "PanicException":
+            raise
+        message = " ".join(str(cause).split())[:120] or type(cause).__name__
+        raise FileFormatError("'{file}' cannot be read as Parquet: {why}", file=name, why=message) from None
+
+
+def is_parquet(path: Path) -> bool:
+    """Return whether a file begins as a Parquet table does."""
+    with path.open("rb") as opened:
+        return opened.read(4) == b"PAR1"
+
+
+def parquet_objects(path: Path, rows: int) -> list[tuple[int, Any]]:
+    """Return the first rows of a Parquet table as objects, as `json_cells` takes them.
+
+    Columns whose cells are no values and no lists of values, such as pictures, are left out.
+
+    Raises:
+        FileFormatError: for a table that cannot be read.
+        MissingExtraError: without polars.
+    """
+    pl = need("polars", extra="tables")
+    with _parquet_errors(path.name), path.open("rb") as opened:
+        table = pl.read_parquet(opened, n_rows=rows)
+        for column in table.get_columns():
+            inner = column.dtype.inner if column.dtype in (pl.List, pl.Array) else column.dtype
+            if inner.is_nested() or inner in (pl.Binary, pl.Object):
+                table = table.drop(column.name)
+        return list(enumerate(table.with_columns(pl.selectors.float().fill_nan(None)).to_dicts(), 1))
+
+
 def read_parquet(file: TableFile) -> ImportedColumns:
     """Read a Parquet table with polars; each value of a list becomes a row, and a row of lists a recording."""
-    with file.path.open("rb") as opened:
-        if opened.read(4) != b"PAR1":
-            raise file.error("'{file}' is no Parquet file: it does not begin with PAR1")
+    if not is_parquet(file.path):
+        raise file.error("'{file}' is no Parquet file: it does not begin with PAR1")
     pattern = file.pattern
     if pattern.missing:
         raise file.error("'{file}' is a Parquet table, whose columns have types: missing is for text, leave it out")
     pl = need("polars", extra="tables")
-    try:
+    with _parquet_errors(file.display_name):
         with file.path.open("rb") as opened:
             there = list(pl.read_parquet_schema(opened))
         names = {role: there[at] for role, at in file.choose_columns(there).items()}
@@ -576,14 +615,6 @@ def read_parquet(file: TableFile) -> ImportedColumns:
             raise file.error(
                 "'{file}' has no dates in column '{column}': leave time_unit out, or give a unit", column=names["time"]
             )
-    except FileFormatError:
-        raise
-    except BaseException as cause:
-        # A panic of polars on damaged bytes is a BaseException but no Exception.
-        if not isinstance(cause, Exception) and type(cause).__name__ != "PanicException":
-            raise
-        message = " ".join(str(cause).split())[:120] or type(cause).__name__
-        raise file.error("'{file}' cannot be read as Parquet: {why}", why=message) from None
     if pattern.row_rate_hz:
         numbers["time"] = np.arange(len(table), dtype=np.float64) * (1000.0 / pattern.row_rate_hz)
         names["time"], in_ms = "row number", True

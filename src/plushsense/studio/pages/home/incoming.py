@@ -130,9 +130,14 @@ class Incoming:
             raise ConfigError(
                 "These are more than {files} files or {gb} GB. Import them in parts.", files=_LIMITS.files, gb=gb
             )
-        table = kind == ".csv" and parse_name(target.name) is None and target.name.lower() != STREAM_NAME
-        alone = kind in (".zip", ".parquet", ".plush") or (table and len(target.parts) == 1)
+        table = kind == ".parquet" or (
+            kind == ".csv" and parse_name(target.name) is None and target.name.lower() != STREAM_NAME
+        )
+        alone = kind in (".zip", ".plush") or (table and len(target.parts) == 1)
         place = self.folder / ("single" if alone else "files") / (target.name if alone else target)
+        if alone and place.exists():
+            # Folders may have archives of one name.
+            place = place.with_name(" ".join(target.parts))
         await run.io_bound(lambda: place.parent.mkdir(parents=True, exist_ok=True))
         await file.save(place)
         if kind == ".plush":
