@@ -14,6 +14,7 @@ from plushsense.dataset.index import open_dataset
 from support.browsing import LONG_MS, PHONE, axe, marked
 from support.foreign_folders import diary, glove
 from support.trainings import train_apart
+from support.xdf_files import XdfStream, write_xdf
 
 pytestmark = pytest.mark.slow
 
@@ -152,6 +153,19 @@ def test_a_label_in_a_column_a_single_file_and_damaged_ones(studio: Fixture, loo
     marked(page, "mapping-right").click()
     keep(page, "columns")
     assert len(open_dataset(home / "datasets" / "columns").recordings) == 12
+    pytest.importorskip("pyxdf")
+    # LabRecorder's files of a sensor that is new, with a stream of markers.
+    glove = XdfStream(
+        "Glove", [0.01 * k for k in range(600)], [[k % 7, k % 5] for k in range(600)], labels=("left", "right")
+    )
+    cues = XdfStream("Cues", [0.5, 2.0, 2.5, 4.0], ["hug", "end", "poke", "end"], format="string", rate=0.0)
+    for who in ("A", "B"):
+        write_xdf(tmp_path / "lab" / who / "monday.xdf", [glove, cues])
+    bring(page, tmp_path / "lab", button="choose_folder")
+    rows.get_by_text("lab/A/monday.xdf").first.wait_for(timeout=LONG_MS)
+    marked(page, "mapping-right").click()
+    keep(page, "lab")
+    assert [r.gesture for r in open_dataset(home / "datasets" / "lab").recordings] == ["hug", "poke"] * 2
     # What cannot be read is one sentence.
     (tmp_path / "noise.csv").write_bytes(bytes(range(256)) * 9)
     (tmp_path / "prose.csv").write_text("Dear diary,\nnothing happened\n")

@@ -33,7 +33,6 @@ from plushsense.dataset.importing.column_parts import GuessSpec
 from plushsense.dataset.importing.guessing import guess_pattern
 from plushsense.dataset.importing.importers import import_recordings, preview_import, propose
 from plushsense.dataset.importing.results import ImportResult
-from plushsense.dataset.importing.xdf import ENDINGS as XDF
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.removed import CONSENT
 from plushsense.dataset.publishing.checking import validate_package
@@ -201,8 +200,7 @@ def _inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         return _contents(dest, done, [{"file": file, "reason": cause.message} for file, cause in refused])
     first = refused[0][1]
     needs = first.message.values.get("needs")
-    files = [file for source in sources for file in (source.rglob("*") if source.is_dir() else [source])]
-    if needs in ("person", CONSENT) or any(file.suffix.lower() in XDF for file in files):
+    if needs in ("person", CONSENT):
         raise first
     for pattern in spec["patterns"]:
         try:

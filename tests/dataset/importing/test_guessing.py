@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -490,3 +491,47 @@ def test_parquet_may_hold_dates_and_lists_and_pictures(tmp_path: Path) -> None:
     (tmp_path / "src" / "train.parquet").write_bytes((tmp_path / "src" / "train.parquet").read_bytes()[:200])
     with pytest.raises(FileFormatError, match=r"'train.parquet' cannot be read as Parquet"):
         guess_pattern(tmp_path / "src")
+
+
+def cues(xdf_stream: Any, name: str, *texts: str) -> Any:
+    """A stream of markers: one each second from 0.5 s on."""
+    return xdf_stream(name, [0.5 + k for k in range(len(texts))], list(texts), format="string", rate=0.0)
+
+
+def stream(xdf_stream: Any, name: str, seed: int, *labels: str, rows: int = 600) -> Any:
+    values = list(zip(*(noise(rows, seed + k) for k in range(len(labels) or 2)), strict=True))
+    return xdf_stream(name, [0.01 * k for k in range(rows)], values, labels=labels)
+
+
+def test_xdf_of_an_own_sensor_is_guessed(tmp_path: Path, xdf_writer: Any, xdf_stream: Any) -> None:
+    for seed, (person, part) in enumerate((p, s) for p in ("ann", "bob", "cy") for s in ("morning", "evening")):
+        glove = stream(xdf_stream, "Glove", seed, "Links oben", "bend")
+        gaze = stream(xdf_stream, "Gaze", seed, "gx", "gy", rows=200)
+        marks = cues(xdf_stream, "Cues", "hug", "end", "Tap", "end", "nothing")
+        keys = cues(xdf_stream, "Keys", "a pressed")
+        xdf_writer(tmp_path / "src" / person / f"{part}.xdf", [gaze, glove, keys, marks])
+    found, guess, seen = guessed(tmp_path / "src")
+    assert found["paths"] == ["{subject}/*.xdf"]
+    assert found["columns"] == {"links_oben": "Links oben", "stream": "Glove", "markers": "Cues"}
+    assert names(found) == ["links_oben", "bend"] and found["layout"]["rate_hz"] == 100.0
+    assert (seen.subjects, seen.gestures) == (["ann", "bob", "cy"], {"Tap": 6, "hug": 6, "nothing": 6})
+    assert sum("there are also 'Gaze'" in doubt or "there are also 'Keys'" in doubt for doubt in guess.doubts) == 2
+    # Another spelling, and what means that nothing happens.
+    pattern = replace(guess.pattern, idle=("nothing",), aliases={"tip": ("Tap",)})
+    assert preview_import(tmp_path / "src", pattern=pattern).gestures == {"hug": 6, "tip": 6}
+    assert (
+        preview_import(tmp_path / "src" / "ann" / "morning.xdf", pattern=replace(pattern, paths=("*.xdf",))).recordings
+        == 2
+    )
+
+
+def test_xdf_without_names_and_without_markers(tmp_path: Path, xdf_writer: Any, xdf_stream: Any) -> None:
+    for seed, (person, gesture) in enumerate((p, g) for p in ("ann", "bob", "cy") for g in GESTURES for _ in range(2)):
+        xdf_writer(tmp_path / "src" / person / f"{gesture}_{seed % 2}.xdf", [stream(xdf_stream, "Glove", seed)])
+    (tmp_path / "src" / "ann" / "hug_7.xdf").write_bytes(b"XDF:")
+    found, _, seen = guessed(tmp_path / "src")
+    assert found["paths"] == ["{subject}/{label}_{recording}.xdf"] and names(found) == ["c1", "c2"]
+    # Each file is one recording of the gesture in its name.
+    assert (seen.recordings, seen.gestures, seen.subjects) == (12, {"hug": 6, "tap": 6}, ["ann", "bob", "cy"])
+    with pytest.raises(FileFormatError, match="no stream of numbers"):
+        guess_pattern(xdf_writer(tmp_path / "cues.xdf", [cues(xdf_stream, "Cues", "hug", "end")]))

@@ -66,6 +66,25 @@ def test_markers_cut_the_stream_into_recordings(
     assert not list((tmp_path / "DS").rglob("*.xdf"))
 
 
+@pytest.mark.parametrize(
+    ("layout", "named"), [("accel-3", "accel-3"), ("plush-14", "plush-15"), ("phone-6", "phone-6")]
+)
+def test_the_layout_is_that_whose_channels_a_stream_names(
+    tmp_path: Path, xdf_writer: Writer, xdf_stream: Any, layout: str, named: str
+) -> None:
+    labels = load_layout(layout).names
+    rows = [[k % 50] * len(labels) for k in range(100)]
+    toy = xdf_stream("toy", [k / 100 for k in range(100)], rows, labels=labels)
+    gaze = xdf_stream("gaze", [k / 50 for k in range(50)], [[k] for k in range(50)], labels=("pupil",))
+    path = xdf_writer(tmp_path / "in" / "sub-A.xdf", [gaze, toy, markers(xdf_stream, (0.2, "Tail pull"))])
+    done = import_recordings(tmp_path / "in", tmp_path / "DS", adopt_proposals=False)
+    assert done.dataset.head.layout.name == named
+    assert f"the layout is '{named}', as a stream of the files has its channels" in done.notes
+    packed = tmp_path / "sub-B.xdfz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    assert import_recordings(packed, tmp_path / "DS2", adopt_proposals=False).dataset.head.layout.name == named
+
+
 def test_the_toys_own_clock_is_taken_where_it_is_sent(tmp_path: Path, xdf_writer: Writer, xdf_stream: Any) -> None:
     rows = [[7 + 11 * i, i, 2 * i, 3 * i] for i in range(100)]
     toy = xdf_stream("toy", [i / 100 for i in range(100)], rows, labels=("device_ms", "x", "y", "z"), format="int32")

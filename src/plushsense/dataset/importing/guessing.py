@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
 from plushsense.core.files import temporary_folder, write_file
 from plushsense.core.recorder_csv import parse_name
 from plushsense.core.sentences import Message
@@ -43,6 +43,8 @@ from plushsense.dataset.importing.path_parts import COLUMN, Candidate, PathParts
 from plushsense.dataset.importing.pattern import (
     ENDINGS,
     INTERVAL,
+    MARKERS_ROLE,
+    STREAM_ROLE,
     ImportPattern,
     path_expression,
 )
@@ -57,6 +59,7 @@ from plushsense.dataset.importing.table_files import (
     one_recording_each,
     parquet_objects,
 )
+from plushsense.dataset.importing.xdf import XdfSample, is_xdf, sample_xdf
 
 _FILES, _LINES, _FEW = 12, 2000, 5
 _HEAD, _MOST_BYTES, _MOST_JSON = 16_384, 400_000, 64 << 20
@@ -66,6 +69,19 @@ _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_CUT = 20
 # Files of micro:bit CreateAI name no rate; older ones write ID, newer ones id.
 _MICROBIT_HZ = {"recordings.ID": 40.0, "recordings.id": 50.0}
+
+_OTHER_STREAMS = {
+    STREAM_ROLE: (
+        "channels",
+        "the channels are those of the stream '{name}'; there are also {others}: if one of them is the toy, name it as "
+        "stream under [columns]",
+    ),
+    MARKERS_ROLE: (
+        "label",
+        "the labels are those of the stream '{name}'; there are also {others}: if one of them names the gestures, name "
+        "it as markers under [columns]",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -129,7 +145,7 @@ def guess_pattern(
             base = source
         if base != source.parent or source.is_dir():
             found = source_files(base)
-        return _guess(source, base, found, given)
+        return _guess(source, base, found, given, limits or UnpackLimits())
 
 
 def _tables(source: Path, found: Iterable[Path], given: GuessSpec) -> tuple[list[Path], list[Path], int, str]:
@@ -137,7 +153,7 @@ def _tables(source: Path, found: Iterable[Path], given: GuessSpec) -> tuple[list
     files = [f for f in split_regular_files(found)[0] if not f.name.startswith(".") and _is_table(f)]
     if not files:
         raise DatasetError(
-            "'{source}' holds no table: a pattern is guessed from text, JSON and Parquet.", source=source
+            "'{source}' holds no table: a pattern is guessed from text, JSON, Parquet and XDF.", source=source
         )
     sizes: Counter[str] = Counter()
     for file in files:
@@ -164,7 +180,7 @@ def _sample(files: list[Path]) -> list[Path]:
     return files[:: max(1, len(files) // _FILES)][:_FILES]
 
 
-def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> GuessedPattern:
+def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec, limits: UnpackLimits) -> GuessedPattern:
     """Guess the pattern of the files ``found`` below ``base``."""
     mine, of_ending, others, ending = _tables(source, found, given)
     some = _sample(mine)
@@ -172,8 +188,10 @@ def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> Gue
     if others:
         guess.doubt("files that do not end in '{ending}' are left out: {n}", "files", ending=ending, n=others)
     form = _format(some[0], ending)
-    guess.is_json = form != "csv"
-    if form == "parquet":
+    guess.is_json = form in ("json", "parquet")
+    if form == "xdf":
+        columns = _xdf_columns(some, guess, limits)
+    elif form == "parquet":
         columns = _json_columns([parquet_objects(f, _LINES) for f in some], guess)
     elif guess.is_json:
         columns = _json_columns([json_objects(_json_text(f, guess)) for f in some], guess)
@@ -181,7 +199,7 @@ def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec) -> Gue
         columns = _text_columns([lines for f in some if (lines := _text(f, guess).splitlines()[:_LINES])], guess)
     if guess.is_json and ENDINGS.get(ending) != form:
         guess.keys["format"] = form
-    if not guess.is_json:
+    if form == "csv":
         mine = [f for f in mine if _fits(_text(f, None, _HEAD).splitlines(), guess)] or mine
     without = sorted(set(of_ending) - set(mine))
     guess_columns(columns, guess)
@@ -248,13 +266,13 @@ def _is_table(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(4096)
     is_text = b"\x00" not in head and path.suffix.lower() not in (".md", ".toml", ".py", ".pdf")
-    return bool(head.strip()) and (is_text or is_parquet(path))
+    return bool(head.strip()) and (is_text or is_parquet(path) or is_xdf(path))
 
 
 def _format(path: Path, ending: str) -> str:
-    """Return the format of a table, as `ImportPattern.format_of` names it: csv, json or parquet."""
-    if is_parquet(path):
-        return "parquet"
+    """Return the format of a table: csv, json, parquet or xdf."""
+    if is_parquet(path) or is_xdf(path):
+        return "parquet" if is_parquet(path) else "xdf"
     return "json" if ENDINGS.get(ending) == "json" or _text(path, None, _HEAD).lstrip()[:1] in ("{", "[") else "csv"
 
 
@@ -272,8 +290,8 @@ def _is_recorded(path: Path) -> bool:
 
 
 def _has_rows(path: Path) -> bool:
-    """Return whether a file is Parquet, or its first lines hold a row with a number, or a JSON value."""
-    if is_parquet(path):
+    """Return whether a file is Parquet or XDF, or its first lines hold a row with a number, or a JSON value."""
+    if is_parquet(path) or is_xdf(path):
         return True
     with path.open("rb") as file:
         lines = file.read(4096).decode("utf-8-sig", "replace").splitlines()
@@ -463,6 +481,37 @@ def _json_columns(samples: list[list[tuple[int, Any]]], guess: PatternDraft) -> 
     return [
         SampledColumn(key, key, parts, of_recording=bool(lists) and key not in lists) for key, parts in cells.items()
     ]
+
+
+def _xdf_columns(files: list[Path], guess: PatternDraft, limits: UnpackLimits) -> list[SampledColumn]:
+    """Return the channels of the stream that may be the toy as columns, with its times and what the markers name.
+
+    Raises:
+        FileFormatError: if no file can be read.
+    """
+    samples: list[XdfSample] = []
+    refused: list[FileFormatError] = []
+    with temporary_folder() as folder:
+        for k, file in enumerate(files):
+            try:
+                samples.append(sample_xdf(file, _LINES, folder / str(k), limits))
+            except FileFormatError as cause:
+                refused.append(cause)
+    if not samples:
+        raise refused[0]
+    first = samples[0]
+    for role, name, others in (
+        (STREAM_ROLE, first.stream, first.others),
+        (MARKERS_ROLE, first.markers, first.other_markers),
+    ):
+        if others:
+            guess.columns[role] = name
+            about, template = _OTHER_STREAMS[role]
+            guess.doubt(template, about, name=name, others=", ".join(f"'{other}'" for other in others[:_FEW]))
+    alike = [sample for sample in samples if list(sample.columns) == list(first.columns)]
+    columns = [SampledColumn(key, key, [sample.columns[key] for sample in alike]) for key in first.columns]
+    labels = [sample.labels for sample in alike if sample.labels]
+    return [*columns, *([SampledColumn("label", "label", labels, of_recording=True)] if labels else [])]
 
 
 def _interval_files(base: Path, without: list[Path], guess: PatternDraft) -> dict[Path, dict[str, str]]:

@@ -104,7 +104,7 @@ class ImportPattern:
             within a name, ``**`` also for folders (default: all files).
         exclude: patterns of files that are left out all the same.
         format: ``csv`` for tables of text, ``json`` for JSON lines or a list of objects, ``parquet`` (default: by the
-            ending of the file).
+            ending of the file). XDF is always known by its ending.
         encoding: encoding of text files, such as ``utf-16`` or ``latin-1``. A byte order mark is never read as text.
         skip_before: lines before the line of column names (from 0).
         skip_after: lines after it, such as units (from 0).
@@ -125,7 +125,8 @@ class ImportPattern:
         columns: column of each channel, and of ``subject``, ``session``, ``recording``, ``label``, ``time``,
             ``host_ms``, ``interval_ms`` (ms to the next row, in place of a time), and ``start``, ``end`` and
             ``duration`` of intervals: its name, ``x#2`` for the second column ``x``, ``#3`` for the third column,
-            ``a.b`` for a value within a JSON object (default: the columns of those names, as for one table).
+            ``a.b`` for a value within a JSON object (default: the columns of those names, as for one table). For XDF,
+            the names of the streams of samples, ``stream``, and of ``markers``.
         idle: labels in a column that mean that nothing happens, such as ``null``: these rows belong to no recording,
             but to the stream of the session (default: none; a gesture with ``idle = true`` keeps such recordings).
         aliases: for each label, a list of other spellings of it in the source. Case, ``_`` and spaces never make a
@@ -263,7 +264,7 @@ def read_pattern(path: str | Path) -> ImportPattern:
 
 def check_roles(columns: Mapping[str, str], layout: Layout, where: str = "--column ") -> None:
     """Raise ConfigError for an unknown role in ``columns``; ``where`` stands before it in the message."""
-    known = (*ROLES, STREAM_ROLE, *INTERVAL_COLUMNS, *layout.names)
+    known = (*ROLES, STREAM_ROLE, MARKERS_ROLE, *INTERVAL_COLUMNS, *layout.names)
     for role in columns:
         if role not in known:
             raise ConfigError(f"{where}{role}=…: accepted are {', '.join(known)}.{nearest(role, known)}")

@@ -24,6 +24,7 @@ from plushsense.dataset.importing.sources import (
     LEFT_OUT,
     PATTERN,
     WINDOWS,
+    XDF_ENDINGS,
     ScanSpec,
     SourceFile,
     SourceScan,
@@ -34,7 +35,7 @@ from plushsense.dataset.importing.sources import (
     split_regular_files,
 )
 from plushsense.dataset.importing.tables import ABOUT_FILE, TableImport
-from plushsense.dataset.importing.xdf import ENDINGS, convert_xdf
+from plushsense.dataset.importing.xdf import convert_xdf, is_xdf
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT
 
 
@@ -81,7 +82,10 @@ def scan_pattern(source: Path, spec: ScanSpec, *, around: Path | None = None) ->
         if spec.mapping is not None:
             person = spec.mapped(relative)
         with scan.refusing(file, name):
-            scan.add(tables.convert(file, name, person, parts))
+            if is_xdf(file):
+                convert_xdf(file, name, person, replace(spec, columns=pattern.columns), scan, parts)
+            else:
+                scan.add(tables.convert(file, name, person, parts))
     scan.found += tables.origins()
     remarks = [n for n in scan.notes if isinstance(n, Message) and n.template == ABOUT_FILE]
     scan.notes = [note for note in scan.notes if note not in remarks]
@@ -142,7 +146,7 @@ def scan_windows(path: Path, spec: ScanSpec) -> SourceScan:
 
 FORMATS: dict[str, Callable[[Path, ScanSpec], SourceScan]] = {
     ".zip": scan_zip,
-    **dict.fromkeys(ENDINGS, scan_xdf),
+    **dict.fromkeys(XDF_ENDINGS, scan_xdf),
     ".parquet": scan_table,
     ".csv": scan_table,
     ".mat": scan_windows,

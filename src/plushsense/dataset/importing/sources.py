@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
+import html
 import os
 import re
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,6 +26,7 @@ from plushsense.dataset.importing.pattern import ImportPattern
 from plushsense.dataset.importing.truncation import Choice
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, PersonInfo, read_csv_rows
 
+XDF_ENDINGS = (".xdf", ".xdfz", ".xdf.gz")
 COMPANIONS = "companions"
 LEFT_OUT = "left out"
 PATTERN, WINDOWS = "pattern", "windows"
@@ -224,6 +228,9 @@ def find_layout(files: Sequence[Path], guess: bool) -> tuple[Layout, Message]:
     found, why = _named_in_header(files), "the header of the files has its channels"
     if not found and (found := _without_header(files)):
         why = f"the files have its {len(found[0].csv.columns)} columns"
+    if found and not any(path.suffix.lower() == ".csv" for path in files):
+        # In XDF, layouts that differ in the clock that the toy sends are the same.
+        found, why = found[-1:], "a stream of the files has its channels"
     if len({layout.csv.columns for layout in found}) == 1 < len(found):
         # They differ in the clock that the toy sends. Files without rows tell nothing, and are refused later.
         found = (readable_layouts(files, [layout.name for layout in found]) or found[::-1])[:1]
@@ -244,23 +251,38 @@ def find_layout(files: Sequence[Path], guess: bool) -> tuple[Layout, Message]:
 
 
 def _named_in_header(files: Iterable[Path]) -> list[Layout]:
-    """Return the built-in layouts with most channels, all of which the header of the first fitting CSV file names."""
+    """Return the built-in layouts with most channels, all of which the first fitting CSV or XDF file names."""
     layouts = [load_layout(name) for name in layout_names()]
     for path in files:
-        if path.suffix.lower() == ".csv":
-            with path.open(encoding="utf-8-sig", errors="replace") as file:
-                texts = {text.strip().strip('"').casefold() for text in re.split("[,;\t]", file.readline(4096))}
-            found = [
-                layout
-                for layout in layouts
-                for of in (dict(zip(layout.csv.columns, layout.csv.header, strict=True)),)
-                if all({name.casefold(), of.get(name, name).casefold()} & texts for name in layout.names)
-            ]
-            # A layout of an accelerometer also fits files that have more channels.
-            if found:
-                most = max(layout.n_channels for layout in found)
-                return [layout for layout in found if layout.n_channels == most]
+        texts = _header_texts(path)
+        found = [
+            layout
+            for layout in layouts
+            for of in (dict(zip(layout.csv.columns, layout.csv.header, strict=True)),)
+            if all({name.casefold(), of.get(name, name).casefold()} & texts for name in layout.names)
+        ]
+        # A layout of an accelerometer also fits files that have more channels.
+        if found:
+            most = max(layout.n_channels for layout in found)
+            return [layout for layout in found if layout.n_channels == most]
     return []
+
+
+def _header_texts(path: Path) -> set[str]:
+    """Return the names of the columns of a CSV file, or the labels of channels at the beginning of an XDF file."""
+    name = path.name.lower()
+    if name.endswith(".csv"):
+        with path.open(encoding="utf-8-sig", errors="replace") as text:
+            return {cell.strip().strip('"').casefold() for cell in re.split("[,;\t]", text.readline(4096))}
+    if not name.endswith(XDF_ENDINGS):
+        return set()
+    with path.open("rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    head = b""
+    with gzip.open(path) if packed else path.open("rb") as whole, contextlib.suppress(EOFError, OSError, zlib.error):
+        head = whole.read(_SAMPLED_BYTES)
+    labels = re.findall(r"<label>([^<]*)</label>", head.decode("utf-8", "replace"))
+    return {html.unescape(label).strip().casefold() for label in labels}
 
 
 def readable_layouts(files: Iterable[Path], names: Sequence[str] = ()) -> list[Layout]:

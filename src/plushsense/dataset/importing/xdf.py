@@ -29,10 +29,11 @@ from plushsense.core.recorder_csv import Frames
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.markers import Marker, MarkerCuts, cut_by_markers, read_marker
-from plushsense.dataset.importing.pattern import MARKERS_ROLE, STREAM_ROLE
-from plushsense.dataset.importing.sources import LEFT_OUT, ScanSpec, SourceFile, SourceScan
+from plushsense.dataset.importing.pattern import MARKERS_ROLE, ROLES, STREAM_ROLE, ImportPattern
+from plushsense.dataset.importing.sources import LEFT_OUT, XDF_ENDINGS, ScanSpec, SourceFile, SourceScan
 from plushsense.dataset.importing.tables import (
     ConvertedSource,
+    LabelledSegment,
     SessionTarget,
     about_file,
     usable_rows,
@@ -41,7 +42,6 @@ from plushsense.dataset.importing.tables import (
 )
 from plushsense.devices.lsl import MARK, MARKERS
 
-ENDINGS = (".xdf", ".xdfz", ".xdf.gz")
 _MAGIC = b"XDF:"
 _HEADER, _SAMPLES = 2, 3
 # Equal rows of two streams, whose clocks were synchronised apart, may differ by this much.
@@ -51,6 +51,8 @@ _BIDS = re.compile(r"(?:^|_)(sub|ses|run)-([^_]+)")
 _CHUNK = 1 << 20
 # Values in a stream of numbers without a rate that may be markers.
 _MOST_EVENTS = 100_000
+# A stream of numbers with fewer samples is rather one of markers.
+_MOST_MARKERS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +104,12 @@ class XdfStream:
 
 
 def is_xdf(path: Path) -> bool:
-    """Return whether a file has one of the `ENDINGS`."""
-    return path.name.lower().endswith(ENDINGS)
+    """Return whether a file has one of the `XDF_ENDINGS`."""
+    return path.name.lower().endswith(XDF_ENDINGS)
 
 
 def _stem(path: Path) -> str:
-    return next((path.name[: -len(end)] for end in ENDINGS if path.name.lower().endswith(end)), path.stem)
+    return next((path.name[: -len(end)] for end in XDF_ENDINGS if path.name.lower().endswith(end)), path.stem)
 
 
 def person_and_session(path: Path, folder: str | None) -> tuple[str | None, str]:
@@ -236,6 +238,60 @@ def _labels(stream: dict[str, Any]) -> list[str]:
     return [str((c.get("label") or [""])[0] or "") if isinstance(c, dict) else "" for c in listed]
 
 
+@dataclass(frozen=True)
+class XdfSample:
+    """What an XDF file holds, from which a pattern is guessed.
+
+    Attributes:
+        stream: name of the stream that may be the toy, and ``others`` of further ones.
+        columns: some values of each of its channels, as texts, and ``time_ms``.
+        markers: name of the stream of markers that may name gestures, and ``other_markers`` of further ones.
+        labels: what its markers name.
+    """
+
+    stream: str
+    others: tuple[str, ...]
+    columns: dict[str, list[str]]
+    markers: str
+    other_markers: tuple[str, ...]
+    labels: list[str]
+
+
+def sample_xdf(path: Path, rows: int, folder: Path, limits: UnpackLimits) -> XdfSample:
+    """Return what an XDF file holds, with the first ``rows`` samples of the longest stream of numbers.
+
+    Args:
+        folder: a new folder, for the content of a compressed file.
+
+    Raises:
+        FileFormatError: for a damaged file, or one without a stream of numbers.
+        MissingExtraError: without pyxdf.
+    """
+    plain = uncompressed(path, folder, limits)
+    streams = _load(plain, complete_chunks(plain, path.name)[0], path.name)
+    numbers = [s for s in streams if not s.is_text and len(s.times_s) > _MOST_MARKERS]
+    if not numbers:
+        raise FileFormatError("'{file}' holds no stream of numbers with a row for each sample", file=path.name)
+    toy = max(numbers, key=lambda s: len(s.times_s))
+    samples = np.asarray(toy.samples)[:rows].reshape(min(rows, len(toy.times_s)), -1)
+    labels = [label.strip() for label in toy.labels]
+    if len(labels) != samples.shape[1] or not all(labels):
+        labels = [f"c{k + 1}" for k in range(samples.shape[1])]
+    columns = {"time_ms": [f"{1000.0 * time:.3f}" for time in toy.times_s[:rows].tolist()]}
+    for label, values in zip(labels, samples.T, strict=True):
+        if label.casefold() not in ROLES["time"]:
+            columns[label] = [str(value) if np.isfinite(value) else "" for value in values]
+    named = {
+        s.name: found
+        for s in streams
+        if (found := [m.label for m in _read_markers([s], None).get(s.number, ()) if m.label and s.is_text])
+    }
+    markers = MARKERS if MARKERS in named else max(named, key=lambda name: len(named[name]), default="")
+    others = tuple(s.name for s in numbers if s.name != toy.name)
+    other_markers = tuple(name for name in named if name != markers)
+    return XdfSample(toy.name, others, columns, markers, other_markers, named.get(markers, []))
+
+
 def _joined(streams: Sequence[XdfStream]) -> tuple[XdfStream, str] | None:
     """Return streams of one source as one, and a note; None if they overlap and are not the same samples."""
     whole, *later = sorted(streams, key=lambda s: float(s.times_s[0]))
@@ -337,18 +393,9 @@ def _find_toy(streams: Sequence[XdfStream], layout: Layout, choices: Mapping[str
     return _Toy(stream, fitting[0][1], notes, others)
 
 
-def _find_markers(
-    streams: Sequence[XdfStream], gestures: GestureSet | None, choice: str
-) -> tuple[list[Marker], dict[int, str], str]:
-    """Return the markers, why other streams of events are not used, by their numbers, and a hint if there are none.
-
-    ``choice`` is a name, or # and a number; "" for the stream of the studio, or the only one that names gestures.
-
-    Raises:
-        FileFormatError: if several streams name gestures, or no stream has the chosen name.
-    """
-    events = [s for s in streams if s.is_irregular and (s.is_text or s.samples.size <= _MOST_EVENTS)]
-    read = {
+def _read_markers(streams: Sequence[XdfStream], gestures: GestureSet | None) -> dict[int, list[Marker]]:
+    """Return the markers in each stream of events, by its number."""
+    return {
         s.number: [
             marker
             for time, sample in zip(s.times_s.tolist(), s.samples, strict=True)
@@ -356,9 +403,34 @@ def _find_markers(
             and (marker := read_marker(time, sample, gestures))
             and not (s.name == MARKERS and marker.text == MARK)
         ]
-        for s in events
+        for s in streams
+        if s.is_irregular and (s.is_text or s.samples.size <= _MOST_EVENTS)
     }
-    events = [s for s in events if read[s.number]]
+
+
+def _spelled(marker: Marker, pattern: ImportPattern) -> Marker:
+    """Return a marker with its label as a pattern spells it; one of idle time only ends a recording."""
+    label = pattern.label_of(marker.label)
+    if not marker.label or pattern.names_gesture(label):
+        return replace(marker, label=label)
+    return replace(marker, label="", ends=True)
+
+
+def _find_markers(
+    streams: Sequence[XdfStream], gestures: GestureSet | None, choice: str, pattern: ImportPattern | None = None
+) -> tuple[list[Marker], dict[int, str], str]:
+    """Return the markers, why other streams of events are not used, by their numbers, and a hint if there are none.
+
+    ``choice`` is a name, or # and a number; "" for the stream of the studio, or the only one that names gestures.
+    ``pattern`` has other spellings of labels, and those of idle time.
+
+    Raises:
+        FileFormatError: if several streams name gestures, or no stream has the chosen name.
+    """
+    read = _read_markers(streams, gestures)
+    if pattern is not None:
+        read = {number: [_spelled(marker, pattern) for marker in markers] for number, markers in read.items()}
+    events = [s for s in streams if read.get(s.number)]
     listed = "; ".join(f"{s} of {s.format}: {_quoted(m.text for m in read[s.number])}" for s in events[:5])
     if choice:
         chosen = [s for s in events if s.is_named(choice)]
@@ -436,8 +508,17 @@ def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Message]:
         yield Message("no marker gives a recording{hint}", hint=hint)
 
 
-def convert_xdf(path: Path, name: str, person: str | None, spec: ScanSpec, scan: SourceScan) -> tuple[str, str]:
+def convert_xdf(
+    path: Path,
+    name: str,
+    person: str | None,
+    spec: ScanSpec,
+    scan: SourceScan,
+    place: Mapping[str, str] | None = None,
+) -> tuple[str, str]:
     """Convert an XDF file, and add its recordings and notes to ``scan``; return the person and the session.
+
+    ``place`` are the parts that its path gives by a pattern: a label makes one recording of the whole file.
 
     Raises:
         ConfigError: for an unknown role in the columns of ``spec``.
@@ -445,6 +526,8 @@ def convert_xdf(path: Path, name: str, person: str | None, spec: ScanSpec, scan:
         MissingExtraError: without pyxdf.
     """
     subject, session = person_and_session(path, person)
+    place = place or {}
+    subject, session = place.get("subject", subject), place.get("session", session)
     if spec.mapping is not None:
         subject = person
     if subject is None:
@@ -458,14 +541,17 @@ def convert_xdf(path: Path, name: str, person: str | None, spec: ScanSpec, scan:
     for role in set(spec.columns) - set(accepted):
         raise ConfigError(f"--column {role}=…: in an XDF file, accepted are {', '.join(accepted)}.")
     target = SessionTarget(spec.new_folder("converted"), subject, session, scan.layout)
-    scan.add(_recordings(path, name, target, scan.gestures, spec))
+    scan.add(_recordings(path, name, target, scan.gestures, spec, place.get("label", "")))
     return subject, session
 
 
 def _recordings(
-    path: Path, display_name: str, target: SessionTarget, gestures: GestureSet | None, spec: ScanSpec
+    path: Path, display_name: str, target: SessionTarget, gestures: GestureSet | None, spec: ScanSpec, label: str
 ) -> Iterator[SourceFile | str]:
-    """Write the recordings of an XDF file into the new folder of ``target``; yield the files, and notes as text."""
+    """Write the recordings of an XDF file into the new folder of ``target``; yield the files, and notes as text.
+
+    The whole file is a recording of ``label``, unless that is "".
+    """
     layout, folder, choices = target.layout, target.folder, spec.columns
     plain = uncompressed(path, folder / "uncompressed", spec.limits)
     good, size = complete_chunks(plain, display_name)
@@ -479,11 +565,17 @@ def _recordings(
         )
     toy = _find_toy([s for s in streams if not s.is_text], layout, choices)
     events = [s for s in streams if s.is_text or s.name != toy.stream.name]
-    markers, others, hint = _find_markers(events, gestures, choices.get(MARKERS_ROLE, ""))
     frames, times, resets = _frames(toy, layout)
-    tolerance_s = max(layout.gap_ms / 1000.0, 2.0 / layout.rate_hz)
-    cuts = cut_by_markers(markers, times, resets, tolerance_s) if len(times) else MarkerCuts()
-    yield from (about_file(display_name, note) for note in [*toy.notes, *_about_cuts(cuts, hint)])
+    others: dict[int, str] = {}
+    if label:
+        said = spec.pattern.label_of(label) if spec.pattern else label
+        cuts, notes = MarkerCuts([LabelledSegment(said, 0, len(times), label)]), toy.notes
+    else:
+        markers, others, hint = _find_markers(events, gestures, choices.get(MARKERS_ROLE, ""), spec.pattern)
+        tolerance_s = max(layout.gap_ms / 1000.0, 2.0 / layout.rate_hz)
+        cuts = cut_by_markers(markers, times, resets, tolerance_s) if len(times) else MarkerCuts()
+        notes = [*toy.notes, *_about_cuts(cuts, hint)]
+    yield from (about_file(display_name, note) for note in notes)
     if not len(frames):
         raise FileFormatError(
             "the stream '{stream}' has no sample with a number in every channel",
@@ -493,7 +585,7 @@ def _recordings(
     about = {"stream": toy.stream.name, "type": toy.stream.type, "nominal_rate_hz": toy.stream.rate}
     original = ConvertedSource(path, display_name, about)
     inner = replace(target, folder=folder / "session")
-    yield from write_session(inner, original, frames, cuts.segments, with_stream=True)
+    yield from write_session(inner, original, frames, cuts.segments, with_stream=not label)
     for stream in streams:
         if reason := (toy.others | others).get(stream.number):
             yield SourceFile(path, LEFT_OUT, origin=f"{display_name}: stream '{stream.name}'", reason=reason)

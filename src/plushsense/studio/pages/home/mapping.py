@@ -10,6 +10,7 @@ from typing import Any
 from nicegui import ui
 
 from plushsense.core.gestures import NOBODY
+from plushsense.dataset.importing.sources import XDF_ENDINGS
 from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.studio.app.shell import heading, on_page, tag
 from plushsense.studio.app.words import Texts, Words
@@ -33,6 +34,8 @@ _SEPARATORS: Texts = {",": "comma", ";": "semicolon", "\t": "tab", "|": "vertica
 _DECIMALS: Texts = {".": "point: 0.5", ",": "comma: 0,5"}
 _FIELDS = "display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 16rem), 1fr)); gap: 4px 16px"
 _MAX_CHANNELS = 6
+# Files that are no text.
+_BINARY = (".parquet", *XDF_ENDINGS)
 _COLUMN = "column"
 
 
@@ -89,11 +92,13 @@ class MappingPanel:
             if self._roles.get("label", "").startswith(_COLUMN):
                 self._several("idle", words("Nothing happens in"), {x: x for x in guess["labels"]}, self._pattern)
         self._doubts("files")
-        with tag(ui.element("details").classes("w-full"), "map-more"):
-            summary(words("Form of the tables"))
-            with ui.element("div").classes("w-full").style(_FIELDS):
-                self._choice("separator", words("Between columns"), _SEPARATORS, self._pattern.get("separator", ","))
-                self._choice("decimal", words("Before the decimals"), _DECIMALS, self._pattern.get("decimal", "."))
+        if not self._pattern["paths"][0].endswith(_BINARY):
+            with tag(ui.element("details").classes("w-full"), "map-more"):
+                summary(words("Form of the tables"))
+                with ui.element("div").classes("w-full").style(_FIELDS):
+                    separator, decimal = (self._pattern.get(k, v) for k, v in (("separator", ","), ("decimal", ".")))
+                    self._choice("separator", words("Between columns"), _SEPARATORS, separator)
+                    self._choice("decimal", words("Before the decimals"), _DECIMALS, decimal)
         self._rows(result)
 
     def _state(self, key: str, value: Any) -> Any:
