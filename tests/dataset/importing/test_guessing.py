@@ -515,7 +515,7 @@ def test_xdf_of_an_own_sensor_is_guessed(tmp_path: Path, xdf_writer: Any, xdf_st
     assert found["columns"] == {"links_oben": "Links oben", "stream": "Glove", "markers": "Cues"}
     assert names(found) == ["links_oben", "bend"] and found["layout"]["rate_hz"] == 100.0
     assert (seen.subjects, seen.gestures) == (["ann", "bob", "cy"], {"Tap": 6, "hug": 6, "nothing": 6})
-    assert sum("there are also 'Gaze'" in doubt or "there are also 'Keys'" in doubt for doubt in guess.doubts) == 2
+    assert sum("there are also Gaze:" in doubt or "there are also Keys:" in doubt for doubt in guess.doubts) == 2
     # Another spelling, and what means that nothing happens.
     pattern = replace(guess.pattern, idle=("nothing",), aliases={"tip": ("Tap",)})
     assert preview_import(tmp_path / "src", pattern=pattern).gestures == {"hug": 6, "tip": 6}

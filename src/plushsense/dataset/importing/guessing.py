@@ -507,7 +507,7 @@ def _xdf_columns(files: list[Path], guess: PatternDraft, limits: UnpackLimits) -
         if others:
             guess.columns[role] = name
             about, template = _OTHER_STREAMS[role]
-            guess.doubt(template, about, name=name, others=", ".join(f"'{other}'" for other in others[:_FEW]))
+            guess.doubt(template, about, name=name, others=", ".join(others[:_FEW]))
     alike = [sample for sample in samples if list(sample.columns) == list(first.columns)]
     columns = [SampledColumn(key, key, [sample.columns[key] for sample in alike]) for key in first.columns]
     labels = [sample.labels for sample in alike if sample.labels]
