@@ -55,6 +55,9 @@ def test_the_last_choice_is_kept_on_every_page_and_over_a_restart(studio: Fixtur
     page.goto(f"{server.url}/publish")
     connected(page)
     assert chosen in marked(page, "dataset").input_value()
+    # A page in another language proposes its own words.
+    latvian = look(language="lv").open(f"{server.url}/record?new=1")
+    assert marked(latvian, "wording").input_value() == "Latviski"
     assert browser.complaints == []
 
 

@@ -362,7 +362,7 @@ def own_list(page: Page) -> None:
     page.get_by_role("alert").filter(has_text="„Mans saraksts” jau ir").wait_for()
     marked(page, "own-protocol").locator("summary").click()
     marked(page, "discard-protocol").click()
-    marked(page, "message").get_by_text("“Mans saraksts” ir izmests").wait_for()
+    marked(page, "message").get_by_text("„Mans saraksts” ir izmests").wait_for()
     assert not marked(page, "discard-protocol").is_visible()
     marked(page, "undo").click()
     marked(page, "discard-protocol").wait_for()

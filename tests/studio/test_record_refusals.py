@@ -94,11 +94,11 @@ def test_a_session_that_cannot_begin(studio: Fixture, look: Fixture, pty_possibl
     connected(page)
     # A file where the folder should be.
     (home / "recordings").write_text("not a folder", encoding="utf-8")
-    fill(page, "S01")
+    fill(page, "S01", CALM)
     said(page, "cannot be used")
     assert (home / "recordings").read_text("utf-8") == "not a folder"
     (home / "recordings").unlink()
-    fill(page, "S01")
+    fill(page, "S01", CALM)
     sat(page, "S01/1")
     marked(page, "end").click()
     marked(page, "end-yes").click()

@@ -367,7 +367,7 @@ def test_decisions_about_many_recordings(waves: Path, studio: Fixture, look: Fix
     marked(page, "new-gesture").click()
     page.get_by_role("option", name="Rest").click()
     marked(page, "relabel-go").click()
-    done("Recordings changed: 4")
+    done("Set to another gesture: 4.")
     assert page.get_by_text("recorded as Wave").count() == 4
     assert {m["action"] for m in marks(waves)} == {"relabel"} and len(marks(waves)) == 4
     assert axe(page) == []
@@ -383,10 +383,10 @@ def test_decisions_about_many_recordings(waves: Path, studio: Fixture, look: Fix
     marked(page, "chosen").get_by_text("Selected: 8").wait_for()
     marked(page, "exclude-selected").click()
     page.get_by_role("button", name="recorded twice").click()
-    done("Recordings changed: 8")
+    done("Excluded: 8.")
     assert sum(r.excluded for r in open_dataset(waves).recordings) == 8
     marked(page, "include-selected").click()
-    done("Recordings changed: 8")
+    done("Included again: 8.")
     marked(page, "undo-list").click()
     done("Undone: including again. Recordings: 8")
     marked(page, "undo-list").click()
@@ -401,10 +401,10 @@ def test_decisions_about_many_recordings(waves: Path, studio: Fixture, look: Fix
     all_of_them = int(marked(page, "accept-sure").inner_text().rpartition(" ")[2])
     assert all_of_them == 7
     marked(page, "accept-sure").click()
-    done("Recordings changed: 7")
+    done("Starts accepted: 7.")
     assert sum(r.start > 0 for r in open_dataset(waves).recordings) == 7
     marked(page, "message").get_by_role("button", name="Undo").click()
-    done("Undone: trim. Recordings: 7")
+    done("Undone: setting start and end. Recordings: 7")
     assert not any(r.start for r in open_dataset(waves).recordings) and raw_hash(waves) == raw
     assert browser.complaints == []
 

@@ -328,7 +328,7 @@ class _Form:
         await change_files(self._page, lambda: workspace.discard(chosen), message, refresh, workspace.restore)
 
     def _choose_words(self) -> None:
-        """Update the wordings to those of the chosen protocol; preselect the last one, or the page's language."""
+        """Update the wordings to those of the chosen protocol; preselect the last one on a page in this language, or this language."""
         self._protocol.error = None
         self._discard.set_visibility(str(self._protocol.value).endswith(".toml"))
         try:
@@ -340,7 +340,8 @@ class _Form:
             self._protocol.error = self._page.words.error(refusal)
             known = (DEFAULT,)
         language = self._page.words.language
-        value = self._choices.last("words", known, language if language in known else DEFAULT)
+        # Not that of a page in another language.
+        value = self._choices.last(f"words-{language}", known, language if language in known else DEFAULT)
         self._words.set_options({w: self._page.words(_WORDINGS.get(w, w)) for w in known}, value=value)
 
     def _request(self) -> SessionRequest:
@@ -374,7 +375,8 @@ class _Form:
         self._subject.value = code
         with self._page.show_errors():
             request = self._request()
-            self._choices.keep(protocol=request.protocol, words=request.words, layout=str(request.layout or ""))
+            choices = {"protocol": request.protocol, "layout": str(request.layout or "")}
+            self._choices.keep(**choices, **{f"words-{self._page.words.language}": request.words})
             anew, mark, lsl = bool(self._anew.value), bool(self._mark.value), bool(self._lsl.value)
             work = partial(self._controller.begin, request, anew, mark, lsl)
             await _open_session(self._page, self._begin, work, self._refused)
