@@ -328,7 +328,7 @@ class _Form:
         await change_files(self._page, lambda: workspace.discard(chosen), message, refresh, workspace.restore)
 
     def _choose_words(self) -> None:
-        """Update the wordings to those of the chosen protocol; preselect the last one on a page in this language, or this language."""
+        """Update the wordings to those of the chosen protocol; preselect the last one in the page's language."""
         self._protocol.error = None
         self._discard.set_visibility(str(self._protocol.value).endswith(".toml"))
         try:
