@@ -316,7 +316,7 @@ def test_a_name_depends_on_every_setting_and_on_the_data(dataset: Dataset) -> No
 
     given: list[dict[str, dict[str, Any]]] = [
         {},
-        {"training": {"batch": 32}},
+        {"training": {"batch": 16}},
         {"training": {"learning_rate": 0.01}},
         {"training": {"patience": 3}},
         {"training": {"turn_deg": 3.0}},

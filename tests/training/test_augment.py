@@ -84,6 +84,45 @@ def test_tilt_turns_gravity_alone() -> None:
     assert 3 < np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 30
 
 
+def played(name: str, x: torch.Tensor, seed: int = 0) -> torch.Tensor:
+    channels = Channels((), Scaler(np.zeros(x.shape[1]), np.ones(x.shape[1])), torch.device("cpu"))
+    augment = augmentations([name], channels)
+    assert augment is not None
+    return augment(x, torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("name", ["random-tempo:0.3", "random-warp:0.4"])
+def test_a_window_played_at_another_speed_passes_through_the_same_values(name: str) -> None:
+    # The first channel counts the samples, so it tells the moment that each new sample comes from.
+    at = torch.arange(200.0)
+    x = torch.stack([at, 3.0 * at - 50.0])[None].expand(300, 2, 200).contiguous()
+    moment, double = played(name, x).unbind(1)
+    assert torch.equal(moment[:, -1], torch.full((300,), 199.0))
+    assert torch.allclose(double, 3.0 * moment - 50.0, atol=1e-3)
+    steps = moment.diff(dim=1)
+    assert float(steps.min()) >= 0.0 and float(moment.min()) >= 0.0
+    assert torch.equal(played(name, x), played(name, x)) and not torch.equal(played(name, x), played(name, x, 1))
+
+
+def test_tempo_is_even_and_warp_is_not() -> None:
+    x = torch.arange(400.0)[None, None].expand(500, 1, 400).contiguous()
+    even, uneven = (played(name, x)[:, 0, 200:].diff(dim=1) for name in ("random-tempo:0.3", "random-warp:0.4"))
+    assert float(even.std(dim=1).max()) < 1e-3
+    speed = even.mean(dim=1)
+    assert 1 / 1.301 < float(speed.min()) < 0.8 and 1.25 < float(speed.max()) < 1.301
+    assert float(uneven.std(dim=1).median()) > 0.1
+    # At the knots, the logarithm of the speed has the spread that is given.
+    last = played("random-warp:0.4", x)[:, 0].diff(dim=1)[:, -1].log()
+    assert abs(float(last.std()) - 0.4) < 0.05 and abs(float(last.mean())) < 0.06
+
+
+def test_what_a_faster_window_lacks_is_held_at_its_beginning() -> None:
+    x = torch.arange(100.0)[None, None].expand(200, 1, 100).contiguous()
+    out = played("random-tempo:0.5", x)[:, 0]
+    faster = out[:, -1] - out[:, -2] > 1.3
+    assert bool(faster.any()) and bool((out[faster][:, :20] == 0.0).all())
+
+
 def test_gain_and_tilt_need_gravity() -> None:
     channels = Channels(((0, 1, 2),), Scaler(np.zeros(3), np.ones(3)), torch.device("cpu"))
     assert augmentations(["random-gain:0.3", "random-tilt:8"], channels) is None

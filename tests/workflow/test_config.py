@@ -8,7 +8,7 @@ from pathlib import Path
 from plushsense.core.layouts import load_layout
 from plushsense.dataset.store import Dataset
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, VECTOR_FILTERS, VECTOR_SYMBOL, symbol_at_rate
-from plushsense.training.spec import VECTOR_AUGMENT
+from plushsense.training.spec import VECTOR_TRAINING
 from plushsense.workflow.config import RunConfig, from_settings, resolve
 from plushsense.workflow.preparation import network_for, prepare
 
@@ -24,7 +24,7 @@ def test_the_default_network_follows_the_rate_of_the_layout() -> None:
 
 
 def test_augmentations_that_are_given_stay_with_any_network(dataset: Dataset, tmp_path: Path) -> None:
-    assert prepare(dataset, from_settings()).training.augment == VECTOR_AUGMENT
+    assert prepare(dataset, from_settings()).training.augment == VECTOR_TRAINING["augment"]
     for given in ({"augment": ["random-rotation:45"]}, {"turn_deg": 45}):
         run = prepare(dataset, from_settings(**given))
         assert run.model.arch == VECTOR_SYMBOL and run.training.augment[0].startswith("random-rotation:45"), given
@@ -32,4 +32,14 @@ def test_augmentations_that_are_given_stay_with_any_network(dataset: Dataset, tm
     path.write_text('[training]\naugment = ["random-rotation:45"]\n')
     run = prepare(dataset, resolve(path))
     assert run.training.augment == ("random-rotation:45",)
-    assert "augment_given" not in run.to_json()
+    assert "given" not in run.to_json()
+
+
+def test_a_network_with_a_vector_layer_has_a_batch_of_its_own_in_the_preset_people(dataset: Dataset) -> None:
+    def batch(**settings: object) -> int:
+        return prepare(dataset, from_settings(**settings)).training.batch
+
+    assert (batch(), batch(augment=["random-tilt:8"]), batch(epochs=3)) == (32, 32, 32)
+    assert (batch(batch=64), batch(preset="loso"), batch(arch="14d1_19d2_19d4", filters="8,12,16")) == (64, 64, 64)
+    assert prepare(dataset, from_settings()).changes == ""
+    assert prepare(dataset, from_settings(batch=64)).changes == "batch 64"

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 # the CPU, the windows are on `Channels.device`; random numbers are copied there without waiting (non_blocking).
 Transform = Callable[["Tensor", "torch.Generator"], "Tensor"]
 
+_WARP_KNOTS = 6
+
 
 @dataclass(frozen=True)
 class Channels:
@@ -125,6 +127,56 @@ def random_tilt(degrees: float, channels: Channels) -> Transform | None:
     return tilt
 
 
+def random_tempo(share: float, channels: Channels) -> Transform | None:
+    """Play every window faster or slower by a random factor, up to ``share`` more or less.
+
+    The logarithm of the factor is uniform.
+    """
+    del channels
+
+    def play(x: Tensor, random: torch.Generator) -> Tensor:
+        speed = _factors(len(x), share, random)[:, None].expand(-1, x.shape[2] - 1)
+        return _played(x, speed.to(x.device, non_blocking=True))
+
+    return play
+
+
+def random_warp(spread: float, channels: Channels) -> Transform | None:
+    """Warp the time of every window: some of its movements become faster, others slower.
+
+    The logarithm of the speed is normally distributed at `_WARP_KNOTS` moments, and linear between them.
+
+    Args:
+        spread: standard deviation of the logarithm.
+    """
+    del channels
+
+    def warp(x: Tensor, random: torch.Generator) -> Tensor:
+        import torch
+
+        knots = spread * torch.randn(len(x), 1, _WARP_KNOTS, generator=random).to(x.device, non_blocking=True)
+        logs = torch.nn.functional.interpolate(knots, size=x.shape[2] - 1, mode="linear", align_corners=True)
+        return _played(x, logs[:, 0].exp())
+
+    return warp
+
+
+def _played(x: Tensor, speed: Tensor) -> Tensor:
+    """Play windows (N, C, T) at a speed between each two samples (N, T - 1); they end with the same sample as before.
+
+    Values between samples are interpolated. Where a faster window would begin before its first sample, that sample is
+    held: read backwards, a turn would have the other sense of rotation.
+    """
+    import torch
+
+    last = x.shape[2] - 1
+    before_end = torch.nn.functional.pad(speed.flip(1).cumsum(1).flip(1), (0, 1))
+    at = (last - before_end).clamp_min(0.0)
+    first = at.floor().clamp_max(last - 1)
+    index = first.long()[:, None].expand(-1, x.shape[1], -1)
+    return torch.lerp(x.gather(2, index), x.gather(2, index + 1), (at - first)[:, None])
+
+
 def _factors(n: int, share: float, random: torch.Generator) -> Tensor:
     """Draw factors (n,) between 1 / (1 + share) and 1 + share, with a uniform logarithm."""
     import torch
@@ -149,6 +201,8 @@ AUGMENTATIONS: dict[str, Augmentation] = {
     "random-rotation": Augmentation(random_rotation, 180.0, "degrees"),
     "random-gain": Augmentation(random_gain, 1.0),
     "random-tilt": Augmentation(random_tilt, 90.0, "degrees"),
+    "random-tempo": Augmentation(random_tempo, 1.0),
+    "random-warp": Augmentation(random_warp, 1.0),
 }
 
 

@@ -34,15 +34,16 @@ class TrainSpec:
 
     Attributes:
         epochs: how often all training windows are read, at most (from 1; default: by the preset).
-        batch: windows for each step of the optimiser (from 2).
+        batch: windows for each step of the optimiser (from 2; default: by the preset and the network).
         learning_rate: step size of the optimiser, Adam (above 0 to 1; default: by the preset).
         halve_every: epochs after which the learning rate is halved (from 1; default: by the preset).
         patience: training stops after this many epochs without a better result on the validation people, and the best
             weights are kept; without it, all epochs run and the last weights are kept (from 1; default: by the preset).
         stop_on: result that ``patience`` watches (one of `STOP_ON`).
         augment: changes of the training windows, each with its strength, such as ``random-rotation:45`` (degrees; the
-            toy is held differently), ``random-gain:0.3`` (stronger or weaker movement) and ``random-tilt:8`` (degrees;
-            down is not exactly known) (default: by the preset).
+            toy is held differently), ``random-tempo:0.3`` (faster or slower), ``random-warp:0.4`` (faster here, slower
+            there), ``random-gain:0.3`` (stronger or weaker movement) and ``random-tilt:8`` (degrees; down is not
+            exactly known) (default: by the preset).
         scaling: ``z-score`` scales each channel by its mean and standard deviation over the training windows; ``none``
             lets the network read values in the units of the layout, as in the authors' script (one of `SCALINGS`).
         weight_decay: factor of the L2 regularisation of all parameters but biases, added to the gradient as in MATLAB's
@@ -172,8 +173,12 @@ PRESETS: dict[str, TrainSpec] = {
     "paper": TrainSpec(),
 }
 
-# Augmentations of the preset "people" for a network with a vector layer, whose outputs a rotation does not change.
-VECTOR_AUGMENT = ("random-gain:0.3", "random-tilt:8")
+# Settings of the preset "people" for a network with a vector layer, whose outputs a rotation does not change. Tempo and
+# warp make up people who move at another pace, and with them more steps pay: docs/measurements/people.md, few people.
+VECTOR_TRAINING: dict[str, Any] = {
+    "augment": ("random-tempo:0.3", "random-warp:0.4", "random-gain:0.3", "random-tilt:8"),
+    "batch": 32,
+}
 
 # Default padding of the network for each preset.
 PADDING: dict[str, str] = {"search": "stream", "loso": "stream", "people": "stream", "paper": "mirror"}

@@ -100,7 +100,7 @@ class EvaluationSpec:
 class RunConfig:
     """Settings of a run as they were given; `plushsense.workflow.preparation.prepare` resolves the rest for a data set.
 
-    ``augment_given``: the augmentations were not left to the preset.
+    ``given``: names of the settings of the training that were not left to the preset.
     """
 
     preset: str = "people"
@@ -110,7 +110,7 @@ class RunConfig:
     evaluation: EvaluationSpec = field(default_factory=EvaluationSpec)
     live: DecideSpec = field(default_factory=DecideSpec)
     anywhere: AnywhereSpec = field(default_factory=AnywhereSpec)
-    augment_given: bool = False
+    given: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -177,9 +177,9 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
     name = tables["training"].pop("preset", "people")
     make: dict[str, Callable[..., Any]] = {**TABLES, "training": preset(name).changed}
     tables["windows"].setdefault("context", CONTEXT[name])
-    augment_given = not {"augment", "turn_deg"}.isdisjoint(tables["training"])
+    chosen = frozenset("augment" if key == "turn_deg" else key for key in tables["training"])
     specs = {table: make[table](**values) for table, values in tables.items()}
-    return RunConfig(name, **specs, augment_given=augment_given)
+    return RunConfig(name, **specs, given=chosen)
 
 
 # The table of each setting of `train`, `evaluate` and `baselines`.

@@ -34,7 +34,7 @@ from plushsense.models.arch import (
 from plushsense.reports.table import text
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
-from plushsense.training.spec import PADDING, PRESETS, VECTOR_AUGMENT, TrainSpec
+from plushsense.training.spec import PADDING, PRESETS, VECTOR_TRAINING, TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
 from plushsense.windows.cut import (
     ANYWHERE,
@@ -135,7 +135,7 @@ class Run:
         usual = {
             "windows": asdict(WindowSpec()),
             "model": asdict(ModelSpec()),
-            "training": _outcome_of(_augmented(PRESETS[self.preset], self.network.vector is not None)),
+            "training": _outcome_of(_training(self.preset, PRESETS[self.preset], self.network.vector is not None)),
         }
         own = self.outcome()
         apart = ("arch", "filters", "padding", "seed", "context")
@@ -168,10 +168,11 @@ def _outcome_of(training: TrainSpec) -> dict[str, Any]:
     return {key: value for key, value in training.key().items() if key not in ("device", "threads")}
 
 
-def _augmented(training: TrainSpec, has_vectors: bool) -> TrainSpec:
-    """Return the settings of a training with the augmentations of a network with a vector layer, if it has one."""
-    usual = training.augment == PRESETS["people"].augment
-    return replace(training, augment=VECTOR_AUGMENT) if has_vectors and usual else training
+def _training(preset: str, spec: TrainSpec, has_vectors: bool, given: Collection[str] = ()) -> TrainSpec:
+    """Return the settings of a training with those of `VECTOR_TRAINING` where they apply and were not ``given``."""
+    if preset != "people" or not has_vectors:
+        return spec
+    return replace(spec, **{key: value for key, value in VECTOR_TRAINING.items() if key not in given})
 
 
 def network_for(config: RunConfig, layout: Layout) -> tuple[str, tuple[int, ...], str]:
@@ -224,7 +225,7 @@ def prepare(dataset: Dataset | str | os.PathLike[str], config: RunConfig, warn: 
         config.preset,
         config.windows,
         replace(model, arch=symbol, filters=filters, padding=padding),
-        config.training if config.augment_given else _augmented(config.training, has_vectors),
+        _training(config.preset, config.training, has_vectors, config.given),
         replace(config.evaluation, classes=classes),
         config.live,
         config.anywhere,

@@ -134,7 +134,7 @@ _PLACEHOLDERS = {
     "arch": f"{DEFAULT_SYMBOL} / {VECTOR_SYMBOL} (100 Hz)",
     "filters": " / ".join(",".join(map(str, counts)) for counts in (DEFAULT_FILTERS, VECTOR_FILTERS)),
     "classes": "shared",
-    "batch": "64",
+    "batch": "64 / 32",
     "architectures": "14d1_39d2_41d4,14d1_19d2_19d4",
     "batches": "64",
     "quantize_aware": "0",
