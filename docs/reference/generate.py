@@ -41,7 +41,7 @@ from plushsense.experiments.sweep.grid import GridSpec, load_grid
 from plushsense.experiments.sweep.grid import problems as grid_problems
 from plushsense.live.reactions import ReactionsFile, load_reactions
 from plushsense.recording.plan import ProtocolFile, load_protocol
-from plushsense.training.spec import CONTEXT, PADDING, PRESETS
+from plushsense.training.spec import ANYWHERE_EPOCHS, CONTEXT, PADDING, PRESETS
 from plushsense.workflow.config import TABLES, resolve
 
 PAGES = Path(__file__).parent
@@ -83,6 +83,10 @@ def _presets() -> str:
     """Return the settings of each preset as a table."""
     keys = ("epochs", "learning_rate", "halve_every", "patience", "augment")
     rows = {key: [_toml(getattr(PRESETS[name], key)) for name in PRESETS] for key in keys}
+    for at, name in enumerate(PRESETS):
+        if name in ANYWHERE_EPOCHS:
+            fewer = _toml(ANYWHERE_EPOCHS[name])
+            rows["epochs"][at] += f" (with a vector layer and training windows anywhere: {fewer})"
     rows |= {"padding": [_toml(PADDING[n]) for n in PRESETS], "context": [_toml(CONTEXT[n]) for n in PRESETS]}
     head = _row("key", *(f"`{name}`" for name in PRESETS)) + _row(*["---"] * (len(PRESETS) + 1))
     return "## Presets\n\n" + head + "".join(_row(f"`{key}`", *(v or "none" for v in row)) for key, row in rows.items())

@@ -15,7 +15,7 @@ from plushsense.core.errors import DatasetError, FileFormatError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import CsvFormat, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
-from plushsense.dataset import index
+from plushsense.dataset import index, store
 from plushsense.dataset.files import IndexStamp, change_head
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
@@ -246,6 +246,17 @@ def test_streams_with_labels_have_the_session_of_their_recordings(tmp_path: Path
     dataset = import_recordings(tmp_path / "plain", tmp_path / "DS", add_to=True).dataset
     assert [s.session for s in dataset.streams] == ["a", "b", "bo_01"]
     assert {r.stream: r.session for r in dataset.recordings} == {s.id: s.session for s in dataset.streams}
+
+
+def test_streams_are_read_once_as_far_as_they_fit(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    ids = [s.id for s in dataset.streams]
+    first = [dataset.read_stream(one) for one in ids]
+    assert all(dataset.read_stream(one) is frames for one, frames in zip(ids, first, strict=True))
+    monkeypatch.setattr(store, "_CACHED_BYTES", first[0].values.nbytes)
+    again = Dataset(dataset.path, dataset.head, dataset.recordings, dataset.streams)
+    newest = [again.read_stream(one) for one in ids][-1]
+    assert again.read_stream(ids[-1]) is newest, "one is always kept, as recordings are read stream by stream"
+    assert again.read_stream(ids[0]) is not first[0] and len(again._cached) == 1
 
 
 def test_the_label_may_be_any_column(tmp_path: Path) -> None:

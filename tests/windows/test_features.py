@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from plushsense.core.errors import BadInput
 from plushsense.core.layouts import load_layout, magnitude_limit
-from plushsense.windows.features import SampleInputs, Scaler, magnitude, network_inputs
+from plushsense.windows.features import RunningMean, SampleInputs, Scaler, magnitude, network_inputs
 from support.fakes import plain_units
 
 LIMIT = magnitude_limit(3)
@@ -69,6 +69,14 @@ def test_gravity_is_the_running_mean_in_plain_integers() -> None:
         state += ((x << 10) - state) >> shift
         assert -(1 << 31) <= state < 1 << 31
         assert rows[n - 1, 3] == state >> 6
+
+
+def test_a_running_mean_of_many_samples_is_that_of_one_at_a_time() -> None:
+    x = np.random.default_rng(0).integers(-32768, 32768, 700)
+    for cuts in ([], [3, 200], [64, 64, 650]):
+        one, many = RunningMean(6), RunningMean(6)
+        means = [many.push_all(part) for part in np.split(x, cuts)]
+        assert np.concatenate(means).tolist() == [one.push(v) for v in x.tolist()], cuts
 
 
 def test_gravity_is_known_soon_follows_a_turn_and_survives_shaking() -> None:

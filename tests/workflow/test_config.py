@@ -10,7 +10,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, VECTOR_FILTERS, VECTOR_SYMBOL, symbol_at_rate
 from plushsense.training.spec import VECTOR_TRAINING
 from plushsense.workflow.config import RunConfig, from_settings, resolve
-from plushsense.workflow.preparation import network_for, prepare
+from plushsense.workflow.preparation import network_for, prepare, prepare_training
 
 
 def test_the_default_network_follows_the_rate_of_the_layout() -> None:
@@ -43,3 +43,16 @@ def test_a_network_with_a_vector_layer_has_a_batch_of_its_own_in_the_preset_peop
     assert (batch(batch=64), batch(preset="loso"), batch(arch="14d1_19d2_19d4", filters="8,12,16")) == (64, 64, 64)
     assert prepare(dataset, from_settings()).changes == ""
     assert prepare(dataset, from_settings(batch=64)).changes == "batch 64"
+
+
+def test_the_preset_has_its_own_epochs_for_windows_anywhere_and_vectors(dataset: Dataset) -> None:
+    for given in ({"context": "anywhere"}, {"train_context": "anywhere"}):
+        run = prepare(dataset, from_settings(**given))
+        assert (run.training.epochs, run.training.halve_every) == (30, 8), given
+        assert not run.changes
+        asked = prepare(dataset, from_settings(epochs=60, **given)).training
+        assert (asked.epochs, asked.halve_every) == (60, 15), "epochs that are given stay"
+        plain = prepare(dataset, from_settings(arch="14d1_19d2_19d4", **given)).training
+        assert (plain.epochs, plain.halve_every) == (60, 15), "without a vector layer"
+    assert prepare_training(dataset, from_settings(train_context="anywhere")).run.training.epochs == 60
+    assert prepare(dataset, from_settings(context="anywhere", preset="loso")).training.epochs == 150

@@ -7,6 +7,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ IDLE_LABELS = frozenset({"at rest", "idle", "no gesture", "no touch", "nothing"}
 """
 
 
+@lru_cache(maxsize=1024)
 def plain_label(label: str) -> str:
     """Normalise a label for comparison: fold case, and turn ``_`` and runs of white space into one space.
 

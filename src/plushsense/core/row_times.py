@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,16 +18,21 @@ def kept_rows(device_ms: NDArray[np.int64], gap_ms: float) -> NDArray[np.int64]:
     odd = np.flatnonzero((step < 0) | (step > gap_ms))
     if not len(odd):
         return rows
-    first = int(odd[0])
-    seen, out_of_order, left_out = int(device_ms[first]), False, []
-    for row, time in enumerate(device_ms[first + 1 :].tolist(), first + 1):
+    times, starts = device_ms.tolist(), (odd + 1).tolist()
+    row, seen, out_of_order, left_out = starts[0], times[starts[0] - 1], False, list[int]()
+    while row < len(times):
+        time = times[row]
         late = -gap_ms <= time - seen < 0
         if not late:
             out_of_order = not out_of_order and not 0 <= time - seen <= gap_ms
         if late or out_of_order:
             left_out.append(row)
+            row += 1
         else:
-            seen = time
+            # All rows are kept up to the next step that is out of order.
+            after = bisect_right(starts, row)
+            row = starts[after] if after < len(starts) else len(times)
+            seen = times[row - 1]
     return np.delete(rows, left_out)
 
 

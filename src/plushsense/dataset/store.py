@@ -337,6 +337,9 @@ class GestureCounts:
     median_s: float | None
 
 
+_CACHED_BYTES = 64 << 20
+
+
 class Dataset:
     """A data set, opened for reading.
 
@@ -358,6 +361,7 @@ class Dataset:
         self.streams = streams
         self._stored_layout = head.layout
         self._with_stretches = True
+        self._cached: dict[str, Frames] = {}
 
     def with_inputs(self, layout: Layout) -> Dataset:
         """Return this data set as a network with ``layout`` reads it; itself if it is of other channels.
@@ -470,13 +474,15 @@ class Dataset:
         return self._frames(read_recording, recording).slice(recording.start, recording.stop)
 
     def read_stream(self, stream: str) -> Frames:
-        """Read the rows of one session stream; the last one is cached, as recordings are read stream by stream."""
-        if self._cached is None or self._cached[0] != stream:
+        """Read the rows of one session stream; the latest are cached, as a training reads all of them several times."""
+        if stream not in self._cached:
             info = next((s for s in self.streams if s.id == stream), None)
             if info is None:
                 raise DatasetError(f"Data set '{self.head.name}' has no stream '{stream}'.")
-            self._cached = (stream, self._frames(read_stream, info))
-        return self._cached[1]
+            self._cached[stream] = self._frames(read_stream, info)
+            while len(self._cached) > 1 and sum(f.values.nbytes for f in self._cached.values()) > _CACHED_BYTES:
+                del self._cached[next(iter(self._cached))]
+        return self._cached[stream]
 
     def read_people(self, subjects: Iterable[str]) -> Iterator[Frames]:
         """Yield the frames of each person's streams, or of their used recordings if there are none."""
@@ -501,8 +507,6 @@ class Dataset:
             # The file may have been deleted because its person was removed.
             self.generation.check()
             raise
-
-    _cached: tuple[str, Frames] | None = None
 
     @cached_property
     def hash(self) -> str:

@@ -52,7 +52,7 @@ from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dat
 from plushsense.workflow.export import export
 from plushsense.workflow.forgetting import forget_everywhere
 from plushsense.workflow.networks import REFIT
-from plushsense.workflow.preparation import count_people, refit_epochs
+from plushsense.workflow.preparation import count_people, network_for, refit_epochs, with_preset
 from plushsense.workflow.project import open_project, save_project
 from plushsense.workflow.reporting import check_folder, load_evaluation
 
@@ -375,8 +375,10 @@ def _train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     out = Path(spec["out"])
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
-    clock, tuning, epochs = Clock(), int(spec.get("quantize_aware", 0)), config.training.epochs
-    again = refit_epochs(config, count_people(open_dataset(spec["dataset"])))
+    dataset = open_dataset(spec["dataset"])
+    clock, tuning = Clock(), int(spec.get("quantize_aware", 0))
+    usual = with_preset(config, network_for(config, dataset.layout)[0])
+    epochs, again = usual.training.epochs, refit_epochs(usual, count_people(dataset))
     whole = epochs + tuning + (again + tuning if again else 0)
 
     def epoch(at: int, of: int, row: EpochRow) -> None:

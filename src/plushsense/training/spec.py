@@ -180,6 +180,11 @@ VECTOR_TRAINING: dict[str, Any] = {
     "batch": 32,
 }
 
+# Epochs of presets for a network with a vector layer and windows cut anywhere in a stream. These overlap, so that an
+# epoch passes each sample through the network about six times: twice as many epochs were no better, and a third fewer
+# gave more false events (docs/measurements/fast-training.md).
+ANYWHERE_EPOCHS: dict[str, int] = {"people": 30}
+
 # Default padding of the network for each preset.
 PADDING: dict[str, str] = {"search": "stream", "loso": "stream", "people": "stream", "paper": "mirror"}
 

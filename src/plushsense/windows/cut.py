@@ -373,16 +373,16 @@ def recordings_in_time(recordings: list[RecordingInfo], spec: WindowSpec | None 
 def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, dataset: Dataset) -> WindowSet:
     ids = tuple(sorted({r.id for r, _ in cuts}))
     number = {identity: i for i, identity in enumerate(ids)}
+    cuts = sorted(cuts, key=lambda cut: number[cut[0].id])
     # Layouts ensure that every input fits 32 bits.
     integers = np.stack([c.x.astype(np.int32).T for _, c in cuts])
     order = np.array([number[r.id] for r, _ in cuts], dtype=np.int64)
-    by_recording = np.argsort(order, kind="stable")
     rows = [(r.stream_row + r.start, r.stream_row + r.stop) if r.stream_row >= 0 else (-1, -1) for r, _ in cuts]
 
     def text(values: Iterable[str]) -> NDArray[np.str_]:
         return np.array(list(values), dtype=np.str_)
 
-    windows = WindowSet(
+    return WindowSet(
         integers=integers,
         units=InputUnits.of(dataset.layout),
         y=np.array([gestures.index(r.gesture) for r, _ in cuts], dtype=np.int64),
@@ -401,7 +401,6 @@ def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, 
         vectors=dataset.layout.input_vectors,
         self_calibration="causal" if dataset.layout.self_calibration else "",
     )
-    return windows.take(by_recording)
 
 
 def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, dict[str, str]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,6 +70,18 @@ class RunningMean:
         self._state += ((x << GRAVITY_STATE_BITS) - self._state) >> (self._samples.bit_length() - 1)
         return self._state >> (GRAVITY_STATE_BITS - GRAVITY_FRACTION_BITS)
 
+    def push_all(self, x: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Add samples (T,); return the mean after each, as `push` does, but several times faster."""
+        begin = min(len(x), (1 << self._most) - self._samples)
+        means = np.array([self.push(value) for value in x[:begin].tolist()], dtype=np.int64)
+        # From here on the shift is constant.
+        shift = self._most
+        rest = (x[begin:] << GRAVITY_STATE_BITS).tolist()
+        states = accumulate(rest, lambda state, high: state + ((high - state) >> shift), initial=self._state)
+        later = np.fromiter(states, np.int64, len(rest) + 1)
+        self._state = int(later[-1])
+        return np.concatenate([means, later[1:] >> (GRAVITY_STATE_BITS - GRAVITY_FRACTION_BITS)])
+
 
 def network_inputs(values: NDArray[np.int64], layout: Layout) -> NDArray[np.int64]:
     """Return the unscaled inputs of a network (T, F) from the measured channels (T, C) of a whole segment, in integers.
@@ -84,8 +97,7 @@ def network_inputs(values: NDArray[np.int64], layout: Layout) -> NDArray[np.int6
             continue
         parts = values[:, [layout.index(part) for part in derived[name].of]]
         if derived[name].kind == "gravity":
-            push = RunningMean(layout.gravity_shift).push
-            columns.append(np.array([push(x) for x in parts[:, 0].tolist()], dtype=np.int64))
+            columns.append(RunningMean(layout.gravity_shift).push_all(parts[:, 0]))
         else:
             columns.append(magnitude(parts))
     return np.stack(columns, axis=1)
@@ -191,6 +203,9 @@ class SampleInputs:
         ]
 
 
+_TOGETHER = 32  # windows scaled at once: few enough for their float64 to stay in the cache
+
+
 @dataclass(frozen=True)
 class Scaler:
     """Scaling of each channel, ``(value - offset) * scale``; both are (F,) float64."""
@@ -230,8 +245,10 @@ class Scaler:
 
     def apply(self, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
         """Scale windows (N, F, T) for the network."""
-        scaled = (x - self.offset[:, None]) * self.scale[:, None]
-        return scaled.astype(np.float32)
+        scaled = np.empty(x.shape, dtype=np.float32)
+        for at in range(0, len(x), _TOGETHER):
+            scaled[at : at + _TOGETHER] = (x[at : at + _TOGETHER] - self.offset[:, None]) * self.scale[:, None]
+        return scaled
 
     def apply_sample(self, sample: Sequence[int] | NDArray[np.int64]) -> NDArray[np.float32]:
         """Scale samples (..., F) for the network."""

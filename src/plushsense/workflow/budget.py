@@ -31,7 +31,16 @@ from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.learning import LearningCurve, accuracies, learning_curve, save_curve
 from plushsense.workflow.networks import REFIT
-from plushsense.workflow.preparation import Run, Warn, count_people, prepare, refit_epochs, silent
+from plushsense.workflow.preparation import (
+    Run,
+    Warn,
+    count_people,
+    network_for,
+    prepare,
+    refit_epochs,
+    silent,
+    with_preset,
+)
 from plushsense.workflow.reporting import PAGE, check_folder, journal_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -218,9 +227,13 @@ class _Making:
         self, dataset: Dataset, out: Path, budget_s: float, config: RunConfig, progress: Reporter, warn: Warn
     ) -> None:
         self._began = time.monotonic()
-        self._dataset, self._out, self._config = dataset, out, config
+        self._dataset, self._out, self._config = (
+            dataset,
+            out,
+            with_preset(config, network_for(config, dataset.layout)[0]),
+        )
         self._budget_s, self._progress, self._warn = budget_s, progress, warn
-        self._again = refit_epochs(config, count_people(dataset)) / config.training.epochs
+        self._again = refit_epochs(self._config, count_people(dataset)) / self._config.training.epochs
         # A resumed run must not choose other folds because the computer is faster or slower than before.
         self._journal = journal_of(dataset, "budgets")
         self._key = job_id({"evaluation": prepare(dataset, config).id, "out": out.name, "seconds": budget_s})
@@ -325,7 +338,7 @@ def _planned(config: RunConfig, plan: BudgetPlan) -> RunConfig:
         training = training.with_epochs(plan.epochs)
     workers = plan.workers or config.evaluation.workers
     evaluation = replace(config.evaluation, split=plan.split, workers=workers)
-    return replace(config, training=training, evaluation=evaluation)
+    return replace(config, training=training, evaluation=evaluation, given=config.given | {"epochs"})
 
 
 def _adjusted(plan: BudgetPlan, cost: TrainingCost, training_s: float, left_s: float) -> BudgetPlan:

@@ -34,7 +34,7 @@ from plushsense.models.arch import (
 from plushsense.reports.table import text
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
-from plushsense.training.spec import PADDING, PRESETS, VECTOR_TRAINING, TrainSpec
+from plushsense.training.spec import ANYWHERE_EPOCHS, PADDING, PRESETS, VECTOR_TRAINING, TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
 from plushsense.windows.cut import (
     ANYWHERE,
@@ -132,10 +132,11 @@ class Run:
 
         The symbol of the network, its filters and padding, the context and the seed are left out.
         """
+        training = preset_for(self.preset, self.trained_on.context, self.network.vector is not None)
         usual = {
             "windows": asdict(WindowSpec()),
             "model": asdict(ModelSpec()),
-            "training": _outcome_of(_training(self.preset, PRESETS[self.preset], self.network.vector is not None)),
+            "training": _outcome_of(training),
         }
         own = self.outcome()
         apart = ("arch", "filters", "padding", "seed", "context")
@@ -168,11 +169,25 @@ def _outcome_of(training: TrainSpec) -> dict[str, Any]:
     return {key: value for key, value in training.key().items() if key not in ("device", "threads")}
 
 
-def _training(preset: str, spec: TrainSpec, has_vectors: bool, given: Collection[str] = ()) -> TrainSpec:
-    """Return the settings of a training with those of `VECTOR_TRAINING` where they apply and were not ``given``."""
-    if preset != "people" or not has_vectors:
-        return spec
-    return replace(spec, **{key: value for key, value in VECTOR_TRAINING.items() if key not in given})
+def preset_for(name: str, context: str, has_vectors: bool) -> TrainSpec:
+    """Return a preset as it trains a network, with a vector layer or without, on windows of a context."""
+    usual = PRESETS[name]
+    if not has_vectors:
+        return usual
+    if name == "people":
+        usual = replace(usual, **VECTOR_TRAINING)
+    return usual.with_epochs(ANYWHERE_EPOCHS.get(name, usual.epochs)) if context == ANYWHERE else usual
+
+
+def with_preset(config: RunConfig, symbol: str) -> RunConfig:
+    """Return the settings with those of the preset for the network of a symbol, as far as they were not given."""
+    has_vectors = parse_symbol(symbol).vector is not None
+    context = config.evaluation.train_context or config.windows.context
+    usual = preset_for(config.preset, context, has_vectors)
+    # The learning rate falls with the epochs.
+    given = config.given | ({"halve_every"} if "epochs" in config.given else set())
+    changes = {key: getattr(usual, key) for key in (*VECTOR_TRAINING, "epochs", "halve_every") if key not in given}
+    return replace(config, training=replace(config.training, **changes))
 
 
 def network_for(config: RunConfig, layout: Layout) -> tuple[str, tuple[int, ...], str]:
@@ -225,7 +240,7 @@ def prepare(dataset: Dataset | str | os.PathLike[str], config: RunConfig, warn: 
         config.preset,
         config.windows,
         replace(model, arch=symbol, filters=filters, padding=padding),
-        _training(config.preset, config.training, has_vectors, config.given),
+        with_preset(config, symbol).training,
         replace(config.evaluation, classes=classes),
         config.live,
         config.anywhere,

@@ -51,15 +51,26 @@ def owners(dataset: Dataset, windows: WindowSet) -> set[str]:
 
 
 def test_a_fold_of_the_benchmark(rested: Dataset, trained: list[WindowSet], tmp_path: Path) -> None:
-    run = prepare(rested, from_settings(filters=(4, 4, 4), epochs=2, classes="all"))
+    config = from_settings(filters=(4, 4, 4), epochs=2, classes="all")
+    run = prepare(rested, config)
     fold = PeopleFold("fold 1", ("P1", "P2", "P3"), ("P4",), ("P5",))
-    recipes = recipes_for(run.dataset, run, {WINDOWS, ANYWHERE}, None)
+    recipes = recipes_for(run.dataset, config, run, {WINDOWS, ANYWHERE})
+    assert [recipe.training.epochs for recipe in recipes.values()] == [2, 2], "as given"
     TrainStreams(recipes, False, tmp_path)(run.dataset, fold, lambda *_: None)
     # Gestures, and anywhere.
     assert len(trained) == 2
     for windows in trained:
         assert owners(rested, windows) == {"P1", "P2", "P3"}
         assert NOBODY in windows.subject and "Rest" in np.array(windows.labels)[windows.y]
+
+
+@pytest.mark.parametrize("context", ["stream", "anywhere"])
+def test_each_network_of_the_benchmark_is_trained_as_by_train(dataset: Dataset, context: str) -> None:
+    config = from_settings(context=context, device="cpu")
+    recipes = recipes_for(dataset, config, prepare(dataset, config), {WINDOWS, ANYWHERE})
+    for name, windows in ((WINDOWS, "stream"), (ANYWHERE, "anywhere")):
+        assert recipes[name].windows.context == windows
+        assert recipes[name].training == prepare(dataset, from_settings(context=windows, device="cpu")).training
 
 
 def test_a_training_that_fits_decisions(rested: Dataset, trained: list[WindowSet]) -> None:

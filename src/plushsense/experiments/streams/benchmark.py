@@ -81,6 +81,7 @@ from plushsense.workflow.preparation import (
     prepare,
     silent,
     windows_for,
+    with_preset,
 )
 from plushsense.workflow.reporting import check_results, journal_of, keep_bundle
 
@@ -161,26 +162,33 @@ class TrainStreams:
         }
 
 
-def recipes_for(dataset: Dataset, run: Run, networks: Collection[str], warn: Warn = silent) -> dict[str, Recipe]:
+def recipes_for(
+    dataset: Dataset, config: RunConfig, run: Run, networks: Collection[str], warn: Warn = silent
+) -> dict[str, Recipe]:
     """Return the recipe of each network in ``networks``; they differ in windows, classes and epochs.
 
-    The context "anywhere" gives several times as many windows, so that half the epochs are still more training steps.
+    ``run`` are the settings of ``config``, resolved for the data set.
     """
     from plushsense.training.fit import resolve_device
 
     if run.network.padding != "stream":
         raise ConfigError(f"A network with {run.network.padding} padding cannot follow a stream: use --padding stream.")
-    training = resolve_device(run.training)
     classes, recipes = run.evaluation.classes, dict[str, Recipe]()
+
+    def training(context: str) -> TrainSpec:
+        one = replace(config.windows, context=context), replace(config.evaluation, train_context=None)
+        spec = with_preset(replace(config, windows=one[0], evaluation=one[1]), run.network.symbol).training
+        return replace(resolve_device(run.training), epochs=spec.epochs, halve_every=spec.halve_every)
+
     if WINDOWS in networks:
         gestures = choose_classes(dataset, classes, warn)
         arch = replace(run.network, classes=len(gestures))
-        recipes[WINDOWS] = Recipe(arch, training, run.scored_on, gestures)
+        recipes[WINDOWS] = Recipe(arch, training(run.scored_on.context), run.scored_on, gestures)
     if ANYWHERE in networks:
         gestures = classes_for(dataset, classes, "anywhere", warn if WINDOWS not in networks else silent)
         arch = replace(run.network, classes=len(gestures))
-        halved = training.with_epochs(-(-training.epochs // 2))
-        recipes[ANYWHERE] = Recipe(arch, halved, replace(run.windows, context="anywhere"), gestures, run.anywhere)
+        windows = replace(run.windows, context="anywhere")
+        recipes[ANYWHERE] = Recipe(arch, training("anywhere"), windows, gestures, run.anywhere)
     return recipes
 
 
@@ -553,7 +561,8 @@ def stream_benchmark(
         out: a folder for the table as JSON and CSV, a page, and its figures.
     """
     spec = spec or BenchmarkSpec()
-    run = prepare(dataset, from_settings(config, **settings))
+    config = from_settings(config, **settings)
+    run = prepare(dataset, config)
     dataset = run.dataset if spec.labels else run.dataset.without_stretches()
     names, seed = spec.names, run.evaluation.seed
     if out is not None:
@@ -561,7 +570,7 @@ def stream_benchmark(
         need("jinja2", extra="reports")
         check_results(Path(out), "A benchmark", TABLE, replace=overwrite)
     people_folds(dataset, spec.split, seed)  # raises before anything is trained
-    recipes = recipes_for(dataset, run, {SYSTEMS[n].network for n in names}, warn)
+    recipes = recipes_for(dataset, config, run, {SYSTEMS[n].network for n in names}, warn)
     fit = TrainStreams(recipes, any(SYSTEMS[n].gate_to for n in names), dataset.path / CACHE / "stream-networks")
     folds = crossvalidated_streams(
         dataset,

@@ -103,7 +103,7 @@ _CONTEXTS: Texts = {
 }
 
 _PRESETS: Texts = {
-    "people": "people: best for new people (60 epochs)",
+    "people": "people: best for new people (30 or 60 epochs)",
     "loso": "loso: as in the paper, stops by itself",
     "paper": "paper: network and windows as in the paper",
     "search": "search: 250 epochs, random windows (leaky)",
