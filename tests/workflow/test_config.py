@@ -56,3 +56,11 @@ def test_the_preset_has_its_own_epochs_for_windows_anywhere_and_vectors(dataset:
         assert (plain.epochs, plain.halve_every) == (60, 15), "without a vector layer"
     assert prepare_training(dataset, from_settings(train_context="anywhere")).run.training.epochs == 60
     assert prepare(dataset, from_settings(context="anywhere", preset="loso")).training.epochs == 150
+
+
+def test_settings_that_differ_from_the_preset_stay_without_being_named(dataset: Dataset) -> None:
+    config = from_settings()
+    training = replace(config.training, batch=16, epochs=5, augment=("random-gain:0.1",))
+    made = prepare(dataset, replace(config, training=training)).training
+    assert (made.batch, made.epochs, made.augment) == (16, 5, ("random-gain:0.1",))
+    assert made.halve_every == config.training.halve_every

@@ -180,13 +180,18 @@ def preset_for(name: str, context: str, has_vectors: bool) -> TrainSpec:
 
 
 def with_preset(config: RunConfig, symbol: str) -> RunConfig:
-    """Return the settings with those of the preset for the network of a symbol, as far as they were not given."""
+    """Return the settings with those of the preset for the network of a symbol, as far as they were not given.
+
+    Values that differ from the preset's were given, too.
+    """
     has_vectors = parse_symbol(symbol).vector is not None
     context = config.evaluation.train_context or config.windows.context
     usual = preset_for(config.preset, context, has_vectors)
+    keys, plain = (*VECTOR_TRAINING, "epochs", "halve_every"), PRESETS[config.preset]
+    given = config.given | {key for key in keys if getattr(config.training, key) != getattr(plain, key)}
     # The learning rate falls with the epochs.
-    given = config.given | ({"halve_every"} if "epochs" in config.given else set())
-    changes = {key: getattr(usual, key) for key in (*VECTOR_TRAINING, "epochs", "halve_every") if key not in given}
+    given |= {"halve_every"} if "epochs" in given else set()
+    changes = {key: getattr(usual, key) for key in keys if key not in given}
     return replace(config, training=replace(config.training, **changes))
 
 

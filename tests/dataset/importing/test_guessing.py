@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, time, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from plushsense.dataset.importing.results import ImportPreview
 pytestmark = pytest.mark.slow
 
 GESTURES = ("hug", "tap")
+PEOPLE = ("P01", "P02", "P03")
 
 
 def guessed(src: Path) -> tuple[dict[str, Any], GuessedPattern, ImportPreview]:
@@ -535,3 +536,42 @@ def test_xdf_without_names_and_without_markers(tmp_path: Path, xdf_writer: Any, 
     assert (seen.recordings, seen.gestures, seen.subjects) == (12, {"hug": 6, "tap": 6}, ["ann", "bob", "cy"])
     with pytest.raises(FileFormatError, match="no stream of numbers"):
         guess_pattern(xdf_writer(tmp_path / "cues.xdf", [cues(xdf_stream, "Cues", "hug", "end")]))
+
+
+def test_parquet_with_axes_truths_and_unlike_files(tmp_path: Path) -> None:
+    pl = pytest.importorskip("polars")
+    for seed, person in enumerate(PEOPLE):
+        (tmp_path / "src" / person).mkdir(parents=True)
+        axes = [noise(120, 9 * seed + k) for k in range(3)]
+        frame = {
+            "t": [time(0, 0, k // 50, 20_000 * (k % 50)) for k in range(120)],
+            "acc": [list(sample) for sample in zip(*axes, strict=True)],
+            "force": [float("inf") if k == 3 else value for k, value in enumerate(noise(120, seed + 50))],
+            "label": [k % 40 >= 20 for k in range(120)],
+        }
+        pl.DataFrame(frame).write_parquet(tmp_path / "src" / person / "all.parquet")
+    pl.DataFrame({"who": ["A"], "age": [7]}).write_parquet(tmp_path / "src" / "people.parquet")
+    (tmp_path / "src" / "bad.parquet").write_bytes(b"PAR1 and no more")
+    found, _, seen = guessed(tmp_path / "src")
+    assert found["columns"]["acc_0"] == "acc.0" and found["layout"]["vectors"] == [["acc_0", "acc_1", "acc_2"]]
+    assert names(found) == ["acc_0", "acc_1", "acc_2", "force"] and found["layout"]["rate_hz"] == 50.0
+    # The label 0 is idle if the pattern says so.
+    assert (seen.recordings, seen.subjects, set(seen.gestures)) == (18, list(PEOPLE), {"0", "1"})
+    pattern = replace(guess_pattern(tmp_path / "src").pattern, idle=("0",))
+    assert preview_import(tmp_path / "src", pattern=pattern).gestures == {"1": 9}
+
+
+def test_xdf_that_differs_in_one_file_and_channels_with_names_of_parts(
+    tmp_path: Path, xdf_writer: Any, xdf_stream: Any
+) -> None:
+    marks = cues(xdf_stream, "Cues", "hug", "end", "tap", "end")
+    for seed, person in enumerate(PEOPLE):
+        labels = ("force", "bend", "subject", "battery")[: 4 if person == "P01" else 3]
+        xdf_writer(tmp_path / "src" / person / "a.xdf", [stream(xdf_stream, "Glove", seed, *labels), marks])
+    found, guess, seen = guessed(tmp_path / "src")
+    assert names(found) == ["force", "bend"] and found["paths"] == ["{subject}/*.xdf"]
+    assert (seen.recordings, seen.subjects) == (6, list(PEOPLE))
+    assert any("'Cues' is taken for the label: 'hug', 'tap'" in doubt for doubt in guess.doubts)
+    # Columns of tables in the same pattern do not disturb.
+    mixed = replace(guess.pattern, columns={"label": "what", "time": "t"})
+    assert preview_import(tmp_path / "src", pattern=mixed).recordings == 6

@@ -57,6 +57,7 @@ from plushsense.dataset.importing.table_files import (
     json_objects,
     number_blocks,
     one_recording_each,
+    parquet_columns,
     parquet_objects,
 )
 from plushsense.dataset.importing.xdf import XdfSample, is_xdf, sample_xdf
@@ -189,6 +190,12 @@ def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec, limits
         guess.doubt("files that do not end in '{ending}' are left out: {n}", "files", ending=ending, n=others)
     form = _format(some[0], ending)
     guess.is_json = form in ("json", "parquet")
+    if form == "parquet":
+        # Tables with other columns, or damaged ones, are left out.
+        columns_of = {file: parquet_columns(file) for file in mine}
+        usual = Counter(filter(None, columns_of.values())).most_common(1)
+        mine = [file for file in mine if usual and columns_of[file] == usual[0][0]] or mine
+        some = _sample(mine)
     if form == "xdf":
         columns = _xdf_columns(some, guess, limits)
     elif form == "parquet":
@@ -499,7 +506,8 @@ def _xdf_columns(files: list[Path], guess: PatternDraft, limits: UnpackLimits) -
                 refused.append(cause)
     if not samples:
         raise refused[0]
-    first = samples[0]
+    usual = Counter(tuple(sample.columns) for sample in samples).most_common(1)[0][0]
+    first = next(sample for sample in samples if tuple(sample.columns) == usual)
     for role, name, others in (
         (STREAM_ROLE, first.stream, first.others),
         (MARKERS_ROLE, first.markers, first.other_markers),
@@ -511,6 +519,11 @@ def _xdf_columns(files: list[Path], guess: PatternDraft, limits: UnpackLimits) -
     alike = [sample for sample in samples if list(sample.columns) == list(first.columns)]
     columns = [SampledColumn(key, key, [sample.columns[key] for sample in alike]) for key in first.columns]
     labels = [sample.labels for sample in alike if sample.labels]
+    if first.labels and not first.other_markers:
+        listed = ", ".join(repr(label) for label in list(dict.fromkeys(first.labels))[:2])
+        guess.doubt(
+            "the column '{column}' is taken for the label: {listed}", "label", column=first.markers, listed=listed
+        )
     return [*columns, *([SampledColumn("label", "label", labels, of_recording=True)] if labels else [])]
 
 

@@ -17,7 +17,7 @@ from plushsense.core.sentences import Message
 from plushsense.dataset.importing.archives import unpack
 from plushsense.dataset.importing.folders import find_people, scan_folder
 from plushsense.dataset.importing.intervals import read_intervals
-from plushsense.dataset.importing.pattern import ImportPattern, check_roles
+from plushsense.dataset.importing.pattern import MARKERS_ROLE, STREAM_ROLE, ImportPattern, check_roles
 from plushsense.dataset.importing.results import NO_PEOPLE_OF_PATTERN, group_flags
 from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
 from plushsense.dataset.importing.sources import (
@@ -83,7 +83,9 @@ def scan_pattern(source: Path, spec: ScanSpec, *, around: Path | None = None) ->
             person = spec.mapped(relative)
         with scan.refusing(file, name):
             if is_xdf(file):
-                convert_xdf(file, name, person, replace(spec, columns=pattern.columns), scan, parts)
+                own = (STREAM_ROLE, MARKERS_ROLE, *scan.layout.names)
+                columns = {role: column for role, column in pattern.columns.items() if role in own}
+                convert_xdf(file, name, person, replace(spec, columns=columns), scan, parts)
             else:
                 scan.add(tables.convert(file, name, person, parts))
     scan.found += tables.origins()

@@ -462,7 +462,7 @@ def _by_sensor(item: Any) -> Any:
     return {**item, "sensors": {name: [row[k] for row in rows] for k, name in enumerate(names)}}
 
 
-def json_cells(objects: Iterable[tuple[int, Any]]) -> dict[str, tuple[list[list[str]], bool]]:
+def json_cells(objects: Sequence[tuple[int, Any]]) -> dict[str, tuple[list[list[str]], bool]]:
     """Return the cells of each value in JSON objects by its path, and whether an object has a list of them.
 
     The cells of each list are apart; those of single values are together.
@@ -476,6 +476,8 @@ def json_cells(objects: Iterable[tuple[int, Any]]) -> dict[str, tuple[list[list[
                 rows[len(value)] += len(value)
         # A list of another length than the series describes something else.
         length = max(rows, key=lambda n: (rows[n], n), default=0)
+        # Short lists in each of many objects are the axes of a sample.
+        length = 0 if length < _SERIES and len(objects) >= _SERIES else length
         for path, value in values.items():
             in_list = isinstance(value, list)
             cells = value if in_list else [value]
@@ -563,6 +565,16 @@ def is_parquet(path: Path) -> bool:
         return opened.read(4) == b"PAR1"
 
 
+def parquet_columns(path: Path) -> tuple[str, ...]:
+    """Return the names of the columns of a Parquet table, sorted; () if it cannot be read."""
+    pl = need("polars", extra="tables")
+    try:
+        with _parquet_errors(path.name), path.open("rb") as opened:
+            return tuple(sorted(pl.read_parquet_schema(opened)))
+    except FileFormatError:
+        return ()
+
+
 def parquet_objects(path: Path, rows: int) -> list[tuple[int, Any]]:
     """Return the first rows of a Parquet table as objects, as `json_cells` takes them.
 
@@ -579,7 +591,8 @@ def parquet_objects(path: Path, rows: int) -> list[tuple[int, Any]]:
             inner = column.dtype.inner if column.dtype in (pl.List, pl.Array) else column.dtype
             if inner.is_nested() or inner in (pl.Binary, pl.Object):
                 table = table.drop(column.name)
-        return list(enumerate(table.with_columns(pl.selectors.float().fill_nan(None)).to_dicts(), 1))
+        floats = pl.selectors.float()
+        return list(enumerate(table.with_columns(pl.when(floats.is_finite()).then(floats)).to_dicts(), 1))
 
 
 def read_parquet(file: TableFile) -> ImportedColumns:
@@ -592,10 +605,20 @@ def read_parquet(file: TableFile) -> ImportedColumns:
     pl = need("polars", extra="tables")
     with _parquet_errors(file.display_name):
         with file.path.open("rb") as opened:
-            there = list(pl.read_parquet_schema(opened))
+            schema = pl.read_parquet_schema(opened)
+        series = [n for n, kind in schema.items() if kind.base_type() in (pl.List, pl.Array)]
+        # ``a.0`` is the first value of the lists in column a.
+        axes = {f"{n}.{k}": (n, k) for n in series for k in range(_SERIES)}
+        there = [*schema, *(name for name in axes if name not in schema)]
         names = {role: there[at] for role, at in file.choose_columns(there).items()}
         with file.path.open("rb") as opened:
-            table = pl.read_parquet(opened, columns=list(dict.fromkeys(names.values())))
+            read = [name if name in schema else axes[name][0] for name in names.values()]
+            table = pl.read_parquet(opened, columns=list(dict.fromkeys(read)))
+        for name in set(names.values()) - set(schema):
+            of, k = axes[name]
+            lists_of = table[of].cast(pl.List(table[of].dtype.inner))
+            table = table.with_columns(lists_of.list.get(k, null_on_oob=True).alias(name))
+        table = table.select(list(dict.fromkeys(names.values())))
         lists = [n for n in table.columns if table[n].dtype.base_type() in (pl.List, pl.Array)]
         if lists:
             row = "row" + "_" * max(map(len, table.columns))
@@ -604,11 +627,7 @@ def read_parquet(file: TableFile) -> ImportedColumns:
         nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
         if nested is not None:
             raise file.error("'{file}' has more than one value in a cell of column '{column}'", column=nested)
-        texts = {
-            r: [text.strip() for text in table[n].cast(pl.String).fill_null("").to_list()]
-            for r, n in names.items()
-            if r in PARTS
-        }
+        texts = {r: [text.strip() for text in _parquet_texts(pl, table[n])] for r, n in names.items() if r in PARTS}
         numbers = {r: _parquet_numbers(pl, table[n]) for r, n in names.items() if r not in PARTS}
         in_ms = "time" in names and table[names["time"]].dtype.is_temporal()
         if pattern.time_unit == "iso" and "time" in names and not in_ms:
@@ -621,7 +640,15 @@ def read_parquet(file: TableFile) -> ImportedColumns:
     return ImportedColumns(names, texts, numbers, np.zeros(len(table), dtype=np.int64), in_ms=in_ms)
 
 
+def _parquet_texts(pl: Any, column: Any) -> list[str]:
+    # As in JSON, true is 1.
+    column = column.cast(pl.Int8) if column.dtype == pl.Boolean else column
+    return list(column.cast(pl.String).fill_null("").to_list())
+
+
 def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
+    if column.dtype == pl.Time:
+        column = column.cast(pl.Int64).cast(pl.Duration("ns"))
     if column.dtype.is_temporal():
         microseconds = column.dt.total_microseconds() if column.dtype == pl.Duration else column.dt.epoch("us")
         column = microseconds.cast(pl.Float64) / 1000.0

@@ -53,6 +53,7 @@ _CHUNK = 1 << 20
 _MOST_EVENTS = 100_000
 # A stream of numbers with fewer samples is rather one of markers.
 _MOST_MARKERS = 50
+_FEWEST_SAMPLES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +245,8 @@ class XdfSample:
 
     Attributes:
         stream: name of the stream that may be the toy, and ``others`` of further ones.
-        columns: some values of each of its channels, as texts, and ``time_ms``.
+        columns: some values of each of its channels, as texts, and ``time_ms``; none of channels that are named as a
+            time, a person or the like.
         markers: name of the stream of markers that may name gestures, and ``other_markers`` of further ones.
         labels: what its markers name.
     """
@@ -269,7 +271,9 @@ def sample_xdf(path: Path, rows: int, folder: Path, limits: UnpackLimits) -> Xdf
     """
     plain = uncompressed(path, folder, limits)
     streams = _load(plain, complete_chunks(plain, path.name)[0], path.name)
-    numbers = [s for s in streams if not s.is_text and len(s.times_s) > _MOST_MARKERS]
+    numbers = [
+        s for s in streams if not s.is_text and len(s.times_s) > (_MOST_MARKERS if s.is_irregular else _FEWEST_SAMPLES)
+    ]
     if not numbers:
         raise FileFormatError("'{file}' holds no stream of numbers with a row for each sample", file=path.name)
     toy = max(numbers, key=lambda s: len(s.times_s))
@@ -279,7 +283,7 @@ def sample_xdf(path: Path, rows: int, folder: Path, limits: UnpackLimits) -> Xdf
         labels = [f"c{k + 1}" for k in range(samples.shape[1])]
     columns = {"time_ms": [f"{1000.0 * time:.3f}" for time in toy.times_s[:rows].tolist()]}
     for label, values in zip(labels, samples.T, strict=True):
-        if label.casefold() not in ROLES["time"]:
+        if not any(label.casefold() in names for names in ROLES.values()):
             columns[label] = [str(value) if np.isfinite(value) else "" for value in values]
     named = {
         s.name: found
@@ -287,9 +291,10 @@ def sample_xdf(path: Path, rows: int, folder: Path, limits: UnpackLimits) -> Xdf
         if (found := [m.label for m in _read_markers([s], None).get(s.number, ()) if m.label and s.is_text])
     }
     markers = MARKERS if MARKERS in named else max(named, key=lambda name: len(named[name]), default="")
-    others = tuple(s.name for s in numbers if s.name != toy.name)
+    others = tuple(s.name for s in numbers if s is not toy)
     other_markers = tuple(name for name in named if name != markers)
-    return XdfSample(toy.name, others, columns, markers, other_markers, named.get(markers, []))
+    name = f"#{toy.number}" if toy.name in others else toy.name
+    return XdfSample(name, others, columns, markers, other_markers, named.get(markers, []))
 
 
 def _joined(streams: Sequence[XdfStream]) -> tuple[XdfStream, str] | None:

@@ -249,7 +249,7 @@ class Halving:
             | {key: getattr(grid, key) for key in ("padding", "norm")},
             "training": {"preset": grid.preset, "epochs": trial.epochs, "batch": max(run.batch for run in trial.runs)}
             | {"threads": grid.threads}
-            | {key: getattr(grid.training, key) for key in sorted(given)},
+            | {key: getattr(grid.training, key) for key in sorted(given | {"augment"})},
             "evaluation": {"classes": grid.classes},
         }
         # Numbers, texts and lists are written alike in TOML and JSON.
