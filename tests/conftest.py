@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fnmatch
-import importlib.util
 import os
 import shutil
 import tempfile
@@ -19,7 +18,7 @@ from hypothesis import settings
 
 from support import apart
 from support.memory import LIMIT_MB, memory_mb
-from support.requirements import missing
+from support.requirements import installed, missing
 
 pytest_plugins = ["support.small_dataset", "support.small_windows", "support.study"]
 
@@ -265,15 +264,13 @@ def lsl_possible() -> None:
 def publish_tools() -> None:
     """The validators of a package (extra publish), and scikit-learn (extra baselines)."""
     for module in ("mlcroissant", "frictionless", "datacite", "sklearn"):
-        if importlib.util.find_spec(module) is None:
-            missing("publish", f"{module} is not installed")
+        installed(module, "publish")
 
 
 @pytest.fixture(scope="session")
 def cluster_possible() -> None:
     """Ray (extra cluster), and the system on which it can run several nodes on one machine."""
-    if importlib.util.find_spec("ray") is None:
-        missing("cluster", "ray is not installed")
+    installed("ray", "cluster")
     if not Path("/dev/shm").is_dir():
         missing("cluster", "several nodes of a Ray cluster on one machine are tested on Linux only")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
@@ -283,22 +280,19 @@ def cluster_possible() -> None:
 def onnx_here() -> None:
     """ONNX and the runtime that tries it (extra onnx)."""
     for module in ("onnx", "onnxruntime"):
-        if importlib.util.find_spec(module) is None:
-            missing("onnx", f"{module} is not installed")
+        installed(module, "onnx")
 
 
 @pytest.fixture(scope="session")
 def litert_here() -> None:
     """LiteRT (extra tflite)."""
-    if importlib.util.find_spec("ai_edge_litert") is None:
-        missing("tflite", "ai-edge-litert is not installed")
+    installed("ai_edge_litert", "tflite")
 
 
 @pytest.fixture(scope="session")
 def scikit_learn() -> None:
     """Scikit-learn (extra baselines)."""
-    if importlib.util.find_spec("sklearn") is None:
-        missing("baselines", "sklearn is not installed")
+    installed("sklearn", "baselines")
 
 
 @pytest.fixture(scope="session")

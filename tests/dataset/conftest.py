@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.recording.writer import SESSION_LOG, SIDECAR, SessionEvent, SessionHead
-from support.requirements import missing
+from support.requirements import installed
 from support.xdf_files import XdfStream, write_xdf
 
 START_MS = 1_760_000_000_000
@@ -70,23 +69,17 @@ def session_writer() -> SessionWriter:
 XdfWriter = Callable[..., Path]
 
 
-def require(request: pytest.FixtureRequest, module: str, word: str) -> None:
-    """Skip, or fail where PLUSHSENSE_REQUIRE names ``word``, when an optional package is not installed."""
-    if importlib.util.find_spec(module) is None:
-        missing(word, f"the package {module} is not installed")
-
-
 @pytest.fixture
-def xdf_writer(request: pytest.FixtureRequest) -> XdfWriter:
+def xdf_writer() -> XdfWriter:
     """Writes one XDF file; needs the reader to be there."""
-    require(request, "pyxdf", "lsl")
+    installed("pyxdf", "lsl")
     return write_xdf
 
 
 @pytest.fixture
-def parquet(request: pytest.FixtureRequest) -> None:
+def parquet() -> None:
     """Parquet can be read and written."""
-    require(request, "polars", "tables")
+    installed("polars", "tables")
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -257,6 +258,7 @@ def test_streams_are_read_once_as_far_as_they_fit(dataset: Dataset, monkeypatch:
     newest = [again.read_stream(one) for one in ids][-1]
     assert again.read_stream(ids[-1]) is newest, "one is always kept, as recordings are read stream by stream"
     assert again.read_stream(ids[0]) is not first[0] and len(again._cached) == 1
+    assert pickle.loads(pickle.dumps(again))._cached == {}, "workers read for themselves"
 
 
 def test_the_label_may_be_any_column(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import itertools
 import json
 import subprocess
@@ -32,7 +31,7 @@ from plushsense.models.reference import random_weights
 from plushsense.runtime.integer import deployable
 from plushsense.windows.features import InputUnits, Scaler, network_inputs
 from support.exports import bundle_of
-from support.requirements import missing
+from support.requirements import installed
 
 # symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
 NETS: list[tuple[str, tuple[int, ...], str, dict[str, Any]]] = [
@@ -189,8 +188,7 @@ def test_the_evaluator_of_onnx_gives_the_same_answers(net: Any, onnx_here: None)
 
 
 def _reader(module: str) -> Any:
-    if importlib.util.find_spec(module) is None:
-        missing("readers", f"{module} is not installed")
+    installed(module, "readers")
     return importlib.import_module(module)
 
 

@@ -13,6 +13,7 @@ from plushsense.dataset.importing.pattern import read_pattern
 from plushsense.dataset.index import open_dataset
 from support.browsing import LONG_MS, PHONE, axe, marked
 from support.foreign_folders import diary, glove
+from support.requirements import installed
 from support.trainings import train_apart
 from support.xdf_files import XdfStream, write_xdf
 
@@ -141,8 +142,27 @@ def test_a_label_in_a_column_a_single_file_and_damaged_ones(studio: Fixture, loo
     marked(page, "mapping-right").click()
     keep(page, "one")
     assert open_dataset(home / "datasets" / "one").subjects == ["S09"]
+    # What cannot be read is one sentence.
+    (tmp_path / "noise.csv").write_bytes(bytes(range(256)) * 9)
+    (tmp_path / "prose.csv").write_text("Dear diary,\nnothing happened\n")
+    for name in ("noise.csv", "prose.csv"):
+        bring(page, tmp_path / name)
+        marked(page, "preview-problem").get_by_text("Šajos failos nav tabulas").wait_for(timeout=LONG_MS)
+        marked(page, "import-cancel").click()
+        marked(page, "preview").wait_for(state="detached")
+    assert "(Angliski:)" not in page.locator("body").inner_text()
+    assert browser.complaints == []
+
+
+def test_folders_of_parquet_and_of_xdf(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    installed("polars", "tables")
+    installed("pyxdf", "lsl")
+    import polars as pl
+
+    home, browser = tmp_path / "home", look()
+    page = browser.open(studio().url)
+    rows = marked(page, "mapping-rows")
     # A folder of Parquet, whose files have one name: person and gesture are in the path.
-    pl = pytest.importorskip("polars")
     for seed, (who, what) in enumerate((p, g) for p in ("A", "B") for g in ("hug", "poke") for _ in range(3)):
         place = tmp_path / "columns" / who / f"{what}_{seed}"
         place.mkdir(parents=True)
@@ -153,7 +173,6 @@ def test_a_label_in_a_column_a_single_file_and_damaged_ones(studio: Fixture, loo
     marked(page, "mapping-right").click()
     keep(page, "columns")
     assert len(open_dataset(home / "datasets" / "columns").recordings) == 12
-    pytest.importorskip("pyxdf")
     # LabRecorder's files of a sensor that is new, with a stream of markers.
     glove = XdfStream(
         "Glove", [0.01 * k for k in range(600)], [[k % 7, k % 5] for k in range(600)], labels=("left", "right")
@@ -163,16 +182,9 @@ def test_a_label_in_a_column_a_single_file_and_damaged_ones(studio: Fixture, loo
         write_xdf(tmp_path / "lab" / who / "monday.xdf", [glove, cues])
     bring(page, tmp_path / "lab", button="choose_folder")
     rows.get_by_text("lab/A/monday.xdf").first.wait_for(timeout=LONG_MS)
+    assert marked(page, "map-more").count() == 0, "there are no separators to choose"
+    assert axe(page) == []
     marked(page, "mapping-right").click()
     keep(page, "lab")
     assert [r.gesture for r in open_dataset(home / "datasets" / "lab").recordings] == ["hug", "poke"] * 2
-    # What cannot be read is one sentence.
-    (tmp_path / "noise.csv").write_bytes(bytes(range(256)) * 9)
-    (tmp_path / "prose.csv").write_text("Dear diary,\nnothing happened\n")
-    for name in ("noise.csv", "prose.csv"):
-        bring(page, tmp_path / name)
-        marked(page, "preview-problem").get_by_text("Šajos failos nav tabulas").wait_for(timeout=LONG_MS)
-        marked(page, "import-cancel").click()
-        marked(page, "preview").wait_for(state="detached")
-    assert "(Angliski:)" not in page.locator("body").inner_text()
     assert browser.complaints == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 
 import pytest
@@ -16,3 +17,9 @@ def missing(what: str, reason: str) -> None:
     if what in REQUIRED:
         pytest.fail(f"{what} is required here (PLUSHSENSE_REQUIRE): {reason}")
     pytest.skip(reason)
+
+
+def installed(module: str, what: str) -> None:
+    """Skip, or fail where PLUSHSENSE_REQUIRE names ``what``, when an optional package is not installed."""
+    if importlib.util.find_spec(module) is None:
+        missing(what, f"the package {module} is not installed")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import plushsense as ps
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.store import Dataset
 from plushsense.workflow.exchange import to_hugging_face, to_panel, to_torch, to_xdf
-from support.requirements import missing
+from support.requirements import installed
 
 pytestmark = pytest.mark.apart("estimator")
 
@@ -21,8 +20,7 @@ pytestmark = pytest.mark.apart("estimator")
 def tables() -> None:
     """Polars and pandas (extra tables)."""
     for module in ("polars", "pandas"):
-        if importlib.util.find_spec(module) is None:
-            missing("tables", f"{module} is not installed")
+        installed(module, "tables")
 
 
 def contents(dataset: Dataset, located: bool = True) -> list[tuple[object, ...]]:
@@ -61,8 +59,7 @@ def test_a_folder_for_hugging_face_is_imported_again(dataset: Dataset, tmp_path:
 
 
 def test_xdf_files_are_imported_again(dataset: Dataset, tmp_path: Path) -> None:
-    if importlib.util.find_spec("pyxdf") is None:
-        missing("lsl", "pyxdf is not installed")
+    installed("pyxdf", "lsl")
     files = to_xdf(dataset, tmp_path / "xdf")
     assert [f.relative_to(tmp_path / "xdf").as_posix() for f in files[:1]] == ["P1/fulldatastream.xdf"]
     again = ps.import_recordings(tmp_path / "xdf", tmp_path / "A", layout=dataset.layout)
@@ -75,8 +72,7 @@ def test_xdf_files_are_imported_again(dataset: Dataset, tmp_path: Path) -> None:
 
 
 def test_readers_of_xdf_keep_the_times_across_lost_samples(tmp_path: Path) -> None:
-    if importlib.util.find_spec("pyxdf") is None:
-        missing("lsl", "pyxdf is not installed")
+    installed("pyxdf", "lsl")
     import pyxdf
 
     rows = [f"P1,{'Shake' if 400 <= i < 500 else ''},{10 * i},{i},1,2" for i in range(600) if not 100 < i < 300]

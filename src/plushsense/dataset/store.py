@@ -363,6 +363,10 @@ class Dataset:
         self._with_stretches = True
         self._cached: dict[str, Frames] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Workers read the streams that they need.
+        return self.__dict__ | {"_cached": {}}
+
     def with_inputs(self, layout: Layout) -> Dataset:
         """Return this data set as a network with ``layout`` reads it; itself if it is of other channels.
 

@@ -227,11 +227,8 @@ class _Making:
         self, dataset: Dataset, out: Path, budget_s: float, config: RunConfig, progress: Reporter, warn: Warn
     ) -> None:
         self._began = time.monotonic()
-        self._dataset, self._out, self._config = (
-            dataset,
-            out,
-            with_preset(config, network_for(config, dataset.layout)[0]),
-        )
+        self._dataset, self._out = dataset, out
+        self._config = with_preset(config, network_for(config, dataset.layout)[0])
         self._budget_s, self._progress, self._warn = budget_s, progress, warn
         self._again = refit_epochs(self._config, count_people(dataset)) / self._config.training.epochs
         # A resumed run must not choose other folds because the computer is faster or slower than before.

@@ -443,8 +443,10 @@ def test_numbers_of_columns_are_no_row(tmp_path: Path, head: str) -> None:
     assert not any("no line of column names" in doubt for doubt in guess.doubts)
 
 
+@pytest.mark.usefixtures("parquet")
 def test_parquet_is_guessed_as_the_same_text_is(tmp_path: Path) -> None:
-    pl = pytest.importorskip("polars")
+    import polars as pl
+
     for seed, (person, gesture, take) in enumerate((p, g, t) for p in "ABC" for g in GESTURES for t in (1, 2)):
         touches(tmp_path / "text" / person / f"{gesture}_{take}.csv", seed)
         (tmp_path / "src" / person).mkdir(parents=True, exist_ok=True)
@@ -464,8 +466,10 @@ def test_parquet_is_guessed_as_the_same_text_is(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("parquet")
 def test_parquet_may_hold_dates_and_lists_and_pictures(tmp_path: Path) -> None:
-    pl = pytest.importorskip("polars")
+    import polars as pl
+
     (tmp_path / "src").mkdir()
     rows, lists = [], []
     for take in range(9):
@@ -538,8 +542,10 @@ def test_xdf_without_names_and_without_markers(tmp_path: Path, xdf_writer: Any, 
         guess_pattern(xdf_writer(tmp_path / "cues.xdf", [cues(xdf_stream, "Cues", "hug", "end")]))
 
 
+@pytest.mark.usefixtures("parquet")
 def test_parquet_with_axes_truths_and_unlike_files(tmp_path: Path) -> None:
-    pl = pytest.importorskip("polars")
+    import polars as pl
+
     for seed, person in enumerate(PEOPLE):
         (tmp_path / "src" / person).mkdir(parents=True)
         axes = [noise(120, 9 * seed + k) for k in range(3)]
@@ -571,7 +577,9 @@ def test_xdf_that_differs_in_one_file_and_channels_with_names_of_parts(
     found, guess, seen = guessed(tmp_path / "src")
     assert names(found) == ["force", "bend"] and found["paths"] == ["{subject}/*.xdf"]
     assert (seen.recordings, seen.subjects) == (6, list(PEOPLE))
-    assert any("'Cues' is taken for the label: 'hug', 'tap'" in doubt for doubt in guess.doubts)
+    assert any(doubt == "the stream 'Cues' names the labels: 'hug', 'tap'" for doubt in guess.doubts)
     # Columns of tables in the same pattern do not disturb.
     mixed = replace(guess.pattern, columns={"label": "what", "time": "t"})
     assert preview_import(tmp_path / "src", pattern=mixed).recordings == 6
+    unused = "row_rate_hz of the pattern are for tables, and not used for XDF"
+    assert unused in preview_import(tmp_path / "src", pattern=replace(guess.pattern, row_rate_hz=25.0)).messages

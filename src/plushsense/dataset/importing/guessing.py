@@ -71,19 +71,6 @@ _MOST_CUT = 20
 # Files of micro:bit CreateAI name no rate; older ones write ID, newer ones id.
 _MICROBIT_HZ = {"recordings.ID": 40.0, "recordings.id": 50.0}
 
-_OTHER_STREAMS = {
-    STREAM_ROLE: (
-        "channels",
-        "the channels are those of the stream '{name}'; there are also {others}: if one of them is the toy, name it as "
-        "stream under [columns]",
-    ),
-    MARKERS_ROLE: (
-        "label",
-        "the labels are those of the stream '{name}'; there are also {others}: if one of them names the gestures, name "
-        "it as markers under [columns]",
-    ),
-}
-
 
 @dataclass(frozen=True)
 class GuessedPattern:
@@ -181,33 +168,35 @@ def _sample(files: list[Path]) -> list[Path]:
     return files[:: max(1, len(files) // _FILES)][:_FILES]
 
 
+def _columns(
+    files: list[Path], ending: str, guess: PatternDraft, limits: UnpackLimits
+) -> tuple[list[SampledColumn], list[Path]]:
+    """Return the columns of most of the tables ``files``, and the files that have them."""
+    some = _sample(files)
+    form = _format(some[0], ending)
+    guess.is_json = form in ("json", "parquet")
+    if guess.is_json and ENDINGS.get(ending) != form:
+        guess.keys["format"] = form
+    if form == "xdf":
+        return _xdf_columns(some, guess, limits), files
+    if form == "json":
+        return _json_columns([json_objects(_json_text(f, guess)) for f in some], guess), files
+    if form == "parquet":
+        there = {file: parquet_columns(file) for file in files}
+        usual = Counter(filter(None, there.values())).most_common(1)
+        files = [file for file in files if usual and there[file] == usual[0][0]] or files
+        return _json_columns([parquet_objects(f, _LINES) for f in _sample(files)], guess), files
+    columns = _text_columns([lines for f in some if (lines := _text(f, guess).splitlines()[:_LINES])], guess)
+    return columns, [f for f in files if _fits(_text(f, None, _HEAD).splitlines(), guess)] or files
+
+
 def _guess(source: Path, base: Path, found: list[Path], given: GuessSpec, limits: UnpackLimits) -> GuessedPattern:
     """Guess the pattern of the files ``found`` below ``base``."""
     mine, of_ending, others, ending = _tables(source, found, given)
-    some = _sample(mine)
     guess = PatternDraft(given=given)
     if others:
         guess.doubt("files that do not end in '{ending}' are left out: {n}", "files", ending=ending, n=others)
-    form = _format(some[0], ending)
-    guess.is_json = form in ("json", "parquet")
-    if form == "parquet":
-        # Tables with other columns, or damaged ones, are left out.
-        columns_of = {file: parquet_columns(file) for file in mine}
-        usual = Counter(filter(None, columns_of.values())).most_common(1)
-        mine = [file for file in mine if usual and columns_of[file] == usual[0][0]] or mine
-        some = _sample(mine)
-    if form == "xdf":
-        columns = _xdf_columns(some, guess, limits)
-    elif form == "parquet":
-        columns = _json_columns([parquet_objects(f, _LINES) for f in some], guess)
-    elif guess.is_json:
-        columns = _json_columns([json_objects(_json_text(f, guess)) for f in some], guess)
-    else:
-        columns = _text_columns([lines for f in some if (lines := _text(f, guess).splitlines()[:_LINES])], guess)
-    if guess.is_json and ENDINGS.get(ending) != form:
-        guess.keys["format"] = form
-    if form == "csv":
-        mine = [f for f in mine if _fits(_text(f, None, _HEAD).splitlines(), guess)] or mine
+    columns, mine = _columns(mine, ending, guess, limits)
     without = sorted(set(of_ending) - set(mine))
     guess_columns(columns, guess)
     if not guess.channels:
@@ -507,23 +496,31 @@ def _xdf_columns(files: list[Path], guess: PatternDraft, limits: UnpackLimits) -
     if not samples:
         raise refused[0]
     usual = Counter(tuple(sample.columns) for sample in samples).most_common(1)[0][0]
-    first = next(sample for sample in samples if tuple(sample.columns) == usual)
-    for role, name, others in (
-        (STREAM_ROLE, first.stream, first.others),
-        (MARKERS_ROLE, first.markers, first.other_markers),
-    ):
-        if others:
-            guess.columns[role] = name
-            about, template = _OTHER_STREAMS[role]
-            guess.doubt(template, about, name=name, others=", ".join(others[:_FEW]))
-    alike = [sample for sample in samples if list(sample.columns) == list(first.columns)]
-    columns = [SampledColumn(key, key, [sample.columns[key] for sample in alike]) for key in first.columns]
-    labels = [sample.labels for sample in alike if sample.labels]
-    if first.labels and not first.other_markers:
-        listed = ", ".join(repr(label) for label in list(dict.fromkeys(first.labels))[:2])
+    alike = [sample for sample in samples if tuple(sample.columns) == usual]
+    first = alike[0]
+    if first.others:
+        guess.columns[STREAM_ROLE] = first.stream
         guess.doubt(
-            "the column '{column}' is taken for the label: {listed}", "label", column=first.markers, listed=listed
+            "the channels are those of the stream '{name}'; there are also {others}: if one of them is the toy, name "
+            "it as stream under [columns]",
+            "channels",
+            name=first.stream,
+            others=", ".join(first.others[:_FEW]),
         )
+    if first.other_markers:
+        guess.columns[MARKERS_ROLE] = first.markers
+        guess.doubt(
+            "the labels are those of the stream '{name}'; there are also {others}: if one of them names the gestures, "
+            "name it as markers under [columns]",
+            "label",
+            name=first.markers,
+            others=", ".join(first.other_markers[:_FEW]),
+        )
+    elif first.labels:
+        listed = ", ".join(repr(label) for label in list(dict.fromkeys(first.labels))[:2])
+        guess.doubt("the stream '{name}' names the labels: {listed}", "label", name=first.markers, listed=listed)
+    columns = [SampledColumn(key, key, [sample.columns[key] for sample in alike]) for key in usual]
+    labels = [sample.labels for sample in alike if sample.labels]
     return [*columns, *([SampledColumn("label", "label", labels, of_recording=True)] if labels else [])]
 
 

@@ -38,6 +38,9 @@ from plushsense.dataset.importing.tables import ABOUT_FILE, TableImport
 from plushsense.dataset.importing.xdf import convert_xdf, is_xdf
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT
 
+# Keys of a pattern that XDF has no use for.
+_OF_TABLES = ("format", "separator", "missing", "between", "row_rate_hz", "time_unit", "intervals")
+
 
 def scan_pattern(source: Path, spec: ScanSpec, *, around: Path | None = None) -> SourceScan:
     """Scan a folder or a file for the files that the pattern in ``spec`` describes, and convert them.
@@ -54,6 +57,8 @@ def scan_pattern(source: Path, spec: ScanSpec, *, around: Path | None = None) ->
     scan.simulated = is_simulation(around or base, all_files)
     scan.found = [replace(f, origin=printable_path(f.source.relative_to(base))) for f in refused]
     tables = TableImport(spec.new_folder("converted"), scan.layout, pattern)
+    if any(map(is_xdf, files)) and (unused := [key for key in _OF_TABLES if getattr(pattern, key)]):
+        scan.notes.append(Message("{keys} of the pattern are for tables, and not used for XDF", keys=", ".join(unused)))
     of_labels = {
         file: place
         for file in files

@@ -285,11 +285,8 @@ def sample_xdf(path: Path, rows: int, folder: Path, limits: UnpackLimits) -> Xdf
     for label, values in zip(labels, samples.T, strict=True):
         if not any(label.casefold() in names for names in ROLES.values()):
             columns[label] = [str(value) if np.isfinite(value) else "" for value in values]
-    named = {
-        s.name: found
-        for s in streams
-        if (found := [m.label for m in _read_markers([s], None).get(s.number, ()) if m.label and s.is_text])
-    }
+    read = _read_markers([s for s in streams if s.is_text], None)
+    named = {s.name: found for s in streams if (found := [m.label for m in read.get(s.number, ()) if m.label])}
     markers = MARKERS if MARKERS in named else max(named, key=lambda name: len(named[name]), default="")
     others = tuple(s.name for s in numbers if s is not toy)
     other_markers = tuple(name for name in named if name != markers)

@@ -176,8 +176,9 @@ def recipes_for(
     classes, recipes = run.evaluation.classes, dict[str, Recipe]()
 
     def training(context: str) -> TrainSpec:
-        one = replace(config.windows, context=context), replace(config.evaluation, train_context=None)
-        spec = with_preset(replace(config, windows=one[0], evaluation=one[1]), run.network.symbol).training
+        windows = replace(config.windows, context=context)
+        evaluation = replace(config.evaluation, train_context=None)
+        spec = with_preset(replace(config, windows=windows, evaluation=evaluation), run.network.symbol).training
         return replace(resolve_device(run.training), epochs=spec.epochs, halve_every=spec.halve_every)
 
     if WINDOWS in networks:
