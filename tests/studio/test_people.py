@@ -230,8 +230,9 @@ def test_a_researcher(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     better = page.locator('[data-row*="7d1_19d1_19d2"] button').first
     with r.step("train on everybody and export"):
         r.click(better)
-        marked(page, "make-export").wait_for()
-        score = marked(page, "details").locator('[data-test="score"]').inner_text()
+        details = marked(page, "details")
+        details.get_by_role("heading", name="7d1_19d1_19d2").wait_for()
+        score = details.locator('[data-test="score"]').inner_text()
         r.click("Train on everybody and export")
         marked(page, "to-exported").first.wait_for(timeout=LONG_MS)
         r.click(marked(page, "to-exported"))

@@ -218,9 +218,14 @@ class PlausibilityMonitor:
         low, high = (channel.in_units(steps)[0] for steps in (values.min(), values.max()))
         first, last = (channel.in_units(steps)[0] for steps in (self._low[at] + 1.0, self._high[at] - 1.0))
         unit = channel.in_units(0.0)[1]
-        usual = f"{first:.4g} to {last:.4g}{unit} of the training"
-        return f"{channel.name} reads {low:.4g} to {high:.4g}{unit}, outside {usual}"
+        usual = f"{_number(first)} to {_number(last)}{unit} of the training"
+        return f"{channel.name} reads {_number(low)} to {_number(high)}{unit}, outside {usual}"
 
 
 def _value(value: tuple[float, str]) -> str:
-    return f"{value[0]:.3g}{value[1]}"
+    return _number(value[0]) + value[1]
+
+
+def _number(value: float) -> str:
+    """Return a number with four digits; a large one is whole, without a power of ten."""
+    return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"

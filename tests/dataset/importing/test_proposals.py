@@ -12,6 +12,7 @@ import pytest
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.recorder_csv import Frames, write_recording
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.guessing import guess_pattern
 from plushsense.dataset.importing.importers import ADOPTED, import_recordings
@@ -20,6 +21,7 @@ from plushsense.dataset.importing.sources import readable_layouts
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.quality.checking import check
 from plushsense.dataset.quality.outliers import far_inputs, find_failed_readings
+from plushsense.dataset.readings import Readings
 from plushsense.runtime.classifier import check_layout
 from plushsense.windows.clock import SampleClock, resample
 from plushsense.windows.cut import WindowSpec, cut_windows
@@ -52,6 +54,24 @@ def test_a_zero_that_cannot_be_known_is_not_proposed(tmp_path: Path) -> None:
     assert "offset" not in {p.key for p in flat.proposals}
     right = import_recordings(analogue(tmp_path / "Q", 0, 8000), tmp_path / "DS2", layout="accel-3")
     assert "offset" not in {p.key for p in right.proposals}
+
+
+@pytest.mark.parametrize("person", range(8))
+def test_a_zero_does_not_follow_from_a_few_directions_near_each_other(tmp_path: Path, person: int) -> None:
+    """A toy that stands, tilted by up to 25°: four to six directions lie on many spheres, most of them wrong."""
+    source = tmp_path / "R" / "P0"
+    source.mkdir(parents=True)
+    rng, clock = np.random.default_rng(person), np.arange(300, dtype=np.int64) * 10
+    for take in range(6):
+        tilt, around = rng.uniform(0, np.deg2rad(25)), rng.uniform(0, 2 * np.pi)
+        up = np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
+        values = 16384 * rng.normal(1, 0.01) * up + rng.normal(0, 20, (300, 3))
+        frames = Frames(np.round(values).astype(np.int64), clock, clock + 1_700_000_000_000)
+        write_recording(source / f"Stand_{1_700_000_000_000 + take}_300.csv", frames, ACCEL)
+    done = import_recordings(tmp_path / "R", tmp_path / "DS", layout="accel-3")
+    assert not done.sensors and not {p.key for p in done.proposals} & {"offset", "unit"}
+    (rest,) = Readings.of(done.dataset, ["P0"]).rest
+    assert rest.is_estimated and rest.one_g == pytest.approx(16384, rel=0.05)
 
 
 def test_two_references_of_an_analogue_converter_are_named(tmp_path: Path, cli: Callable[..., Any]) -> None:

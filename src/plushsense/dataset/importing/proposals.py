@@ -36,6 +36,11 @@ _BLOCK_S = 0.3
 _STILLEST = 0.2
 _LEAST_BLOCKS = 12
 _STANDARD_ERROR = 0.05
+# A sphere has four unknowns. What moves slowly while held is off by this share of the radius in each direction, and
+# directions less than this share apart are one.
+_UNKNOWNS = 4
+_MOTION = 0.01
+_DIRECTION = 0.3
 # A session lies on a sphere if half of its still blocks are at most this share of the radius away; it needs so many.
 _ON_SPHERE = 0.1
 _LEAST_POINTS = 3
@@ -509,16 +514,23 @@ def _sphere(points: Floats) -> Sphere | None:
         radius = float(np.sqrt(max(solution[3] + centre @ centre, 0.0)))
         error = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
         # Half a step is the error of a sensor with coarse steps.
-        closer = error <= 3 * 1.4826 * np.median(error[keep]) + 0.5
+        closer = error <= 3 * 1.4826 * np.median(error[keep]) + max(0.5, _MOTION * radius)
         if np.array_equal(closer, keep):
             break
         keep = closer
-    spread = np.linalg.svd(points[keep] - points[keep].mean(axis=0), compute_uv=False)
-    # Neighbouring blocks are not independent: count them as if there were a tenth.
-    uncertain = float(np.std(error[keep])) * np.sqrt(10)
-    if radius <= 0 or spread[-1] <= 0 or uncertain / spread[-1] > _STANDARD_ERROR:
+    if radius <= 0:
         return None
-    return centre, radius
+    # Blocks in one direction are not independent, however many: four directions lie on a sphere whatever their error.
+    kept = points[keep]
+    cells = np.unique(np.round((kept - centre) / (_DIRECTION * radius)), axis=0, return_inverse=True)[1].ravel()
+    n = cells.max() + 1
+    means = np.stack([np.bincount(cells, kept[:, i]) for i in range(3)], axis=1) / np.bincount(cells)[:, None]
+    if n <= _UNKNOWNS:
+        return None
+    spread = np.linalg.svd(means - means.mean(axis=0), compute_uv=False)[-1]
+    off = np.linalg.norm(means - centre, axis=1) - radius
+    uncertain = max(float(np.sqrt(np.square(off).sum() / (n - _UNKNOWNS))), _MOTION * radius)
+    return (centre, radius) if uncertain <= _STANDARD_ERROR * spread else None
 
 
 def _window(dataset: Dataset) -> Iterator[Proposal]:
