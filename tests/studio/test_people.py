@@ -68,6 +68,11 @@ class Person:
         self.clicks += 1
         self.page.get_by_label(re.compile(f"^{re.escape(label)}")).first.fill(text)
 
+    def fill_mark(self, mark: str, text: str) -> None:
+        """Fill in a marked field."""
+        self.clicks += 1
+        marked(self.page, mark).fill(text)
+
     def choose(self, mark: str, text: str) -> None:
         """Choose from a list."""
         self.click(marked(self.page, mark))
@@ -181,6 +186,7 @@ def test_a_teacher(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     t.done()
 
 
+@pytest.mark.usefixtures("publish_tools")
 def test_a_researcher(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     archive = tmp_path / "study.zip"
     with zipfile.ZipFile(archive, "w") as file:
@@ -242,6 +248,18 @@ def test_a_researcher(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
         assert marked(page, "score").inner_text() == score
         with zipfile.ZipFile(r.take_away("Download as a zip")) as made:
             assert any(name.endswith("plush_model.c") for name in made.namelist())
+    with r.step("publish"):
+        r.click("Publish")
+        page.wait_for_url("**/publish**")
+        connected(page)
+        assert "gloves" in marked(page, "new").inner_text()
+        for mark, said in {"data-title": "Gloves", "description": "Four people touch.", "creator-name": "Byron, Ada",
+                           "contact-name": "Ada", "contact-mail": "ada@example.org",
+                           "consent": "The people agreed to publication."}.items():  # fmt: skip
+            r.fill_mark(mark, said)
+        r.choose("licence", "CC-BY-4.0")
+        r.click(marked(page, "do"))
+        marked(page, "validators").wait_for(timeout=LONG_MS)
     assert browser.complaints == []
     r.done()
 

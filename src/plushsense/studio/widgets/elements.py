@@ -313,7 +313,12 @@ def title_of(words: Words, job: StudioJob) -> str:
 
 async def titles(workspace: Workspace) -> dict[str, str]:
     """Return the data sets to choose from; keys are paths, values are names."""
-    return await run.io_bound(lambda: {str(p): f"{workspace.title(p)} ({p.name})" for p in workspace.datasets()}) or {}
+
+    def found() -> dict[str, str]:
+        named = ((path, workspace.title(path)) for path in workspace.datasets())
+        return {str(path): title if title == path.name else f"{title} ({path.name})" for path, title in named}
+
+    return await run.io_bound(found) or {}
 
 
 _VENDOR = Path(__file__).parent / "vendor" / "uplot"
