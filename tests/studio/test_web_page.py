@@ -9,6 +9,7 @@ import base64
 import csv
 import gzip
 import io
+import json
 import re
 import zipfile
 from collections.abc import Callable, Iterator
@@ -617,6 +618,145 @@ def test_the_page_of_the_documentation_reads_a_toy(look: Callable[..., Look], tr
     data = base64.b64encode(b"noise " * 15 + b"\n" + _bytes(_PLUSH, _stream(_PLUSH, 16))).decode()
     page.evaluate("(data) => sendBytes(data)", data)
     page.wait_for_function("() => state.textContent === 'begun: negative'")
+
+
+@dataclass
+class Tab:
+    """A tab that Playwright does not hold in the foreground, as it does with its own; driven by way of the browser."""
+
+    browser: Any
+    target: str
+    session: str
+    replies: dict[int, Any]
+
+    def call(self, method: str, **given: Any) -> Any:
+        """Call a method of Chrome's DevTools protocol in the tab."""
+        number = len(self.replies) + 1
+        message = json.dumps({"id": number, "method": method, "params": given})
+        self.browser.send("Target.sendMessageToTarget", {"sessionId": self.session, "message": message})
+        while number not in self.replies:  # they come with any other reply
+            self.browser.send("Target.getTargets")
+        return self.replies[number]["result"]
+
+    def run(self, code: str) -> Any:
+        """Evaluate an expression, and wait for its promise."""
+        done = self.call("Runtime.evaluate", expression=code, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in done, done
+        return done["result"].get("value")
+
+    def until(self, condition: str) -> None:
+        """Wait until an expression is true."""
+        while not self.run(condition):
+            pass
+
+    def minimize(self, minimized: bool) -> None:
+        """Take its window, in which it is alone, out of sight or back, and wait until the page knows it."""
+        window = self.browser.send("Browser.getWindowForTarget", {"targetId": self.target})["windowId"]
+        bounds = {"windowState": "minimized" if minimized else "normal"}
+        self.browser.send("Browser.setWindowBounds", {"windowId": window, "bounds": bounds})
+        self.until(f"document.hidden === {json.dumps(minimized)}")
+
+
+@pytest.fixture
+def background(pages: Callable[..., Opened]) -> Iterator[Callable[..., Tab]]:
+    """``background(bundle)`` opens the page in a `Tab`, the clock of which runs as the test says."""
+    made: list[tuple[Any, str]] = []
+
+    def new(bundle: Bundle) -> Tab:
+        opened = pages(bundle)
+        browser = opened.page.context.browser.new_browser_cdp_session()
+        context = browser.send("Target.createBrowserContext")["browserContextId"]
+        made.append((browser, context))
+        target = browser.send("Target.createTarget", {"url": "about:blank", "browserContextId": context})["targetId"]
+        session = browser.send("Target.attachToTarget", {"targetId": target, "flatten": False})["sessionId"]
+        tab = Tab(browser, target, session, {})
+
+        def note(event: Any) -> None:
+            message = json.loads(event["message"])
+            if "id" in message:
+                tab.replies[message["id"]] = message
+
+        browser.on("Target.receivedMessageFromTarget", note)
+        tab.call("Page.enable")
+        tab.call("Page.addScriptToEvaluateOnNewDocument", source=f"({_PORT})(); ({_CLOCK})()")
+        tab.call("Page.navigate", url=opened.page.url)
+        tab.until("document.readyState === 'complete' && 'plushPage' in window")
+        return tab
+
+    yield new
+    for browser, context in made:
+        browser.send("Target.disposeBrowserContext", {"browserContextId": context})
+        browser.detach()
+
+
+# The page's clock is the toy's: it goes on as the toy's bytes come, which wait while the page is frozen.
+_CLOCK = """() => {
+  const { port1, port2 } = new MessageChannel(), { fillRect } = CanvasRenderingContext2D.prototype;
+  let now = 0;
+  performance.now = () => now;
+  window.pictures = 0;
+  window.seen = [];
+  CanvasRenderingContext2D.prototype.fillRect = function (...area) { pictures++; fillRect.apply(this, area) };
+  for (const name of ['freeze', 'resume']) document.addEventListener(name, () => seen.push(name));
+  port1.onmessage = ({ data }) => sendBytes(data);
+  window.toySends = (text, ms) => { now += ms; if (text) port2.postMessage(text) };
+}"""
+
+
+def test_after_a_minute_in_the_background_the_page_is_right_again(
+    background: Callable[..., Tab], trained: Bundle
+) -> None:
+    """In a hidden tab, in one that the browser has frozen, and after a minute of which nothing is left."""
+    tab, model = background(trained), integer_model(trained)
+    stream = _stream(_PLUSH, 195, person=2)
+    # In the midst of events, which a silence would end.
+    at = {"hidden": 650, "frozen": 6700, "lost": 12_550, "over": 18_600}
+    read = [*stream[: at["lost"]], *stream[at["over"] :]]
+
+    def send(frames: list[Frame], piece: int = 150) -> None:
+        """Have the toy send frames, 1.5 seconds in a piece."""
+        for begin in range(0, len(frames), piece):
+            some = frames[begin : begin + piece]
+            text = base64.b64encode(_bytes(_PLUSH, some)).decode()
+            tab.run(f"toySends({json.dumps(text)}, {10 * len(some)})")
+
+    def received(frames: list[Frame]) -> None:
+        tab.until(f"plushPage.run.frames === {len(frames)}")
+
+    tab.run("document.getElementById('serial').click()")
+    tab.until("document.body.classList.contains('running')")
+    tab.run("canvas.scrollIntoView()")
+    tab.run("sendBytes(btoa('\\n'))")
+    send(stream[: at["hidden"]])
+    received(stream[: at["hidden"]])
+    tab.until("pictures > 0")
+    tab.minimize(True)
+    tab.run("pictures = 0")
+    send(stream[at["hidden"] : at["frozen"]])
+    received(stream[: at["frozen"]])
+    assert tab.run("pictures") == 0
+    tab.call("Page.setWebLifecycleState", state="frozen")
+    tab.until("seen.at(-1) === 'freeze'")
+    send(stream[at["frozen"] : at["lost"]], 1000)
+    assert tab.run("plushPage.run.frames") == at["frozen"]
+    tab.call("Page.setWebLifecycleState", state="active")
+    received(stream[: at["lost"]])
+    tab.call("Page.setWebLifecycleState", state="frozen")
+    tab.until("seen.length === 3")
+    tab.run(f"toySends('', {10 * (at['over'] - at['lost'])})")
+    send(stream[at["over"] :])
+    tab.call("Page.setWebLifecycleState", state="active")
+    received(read)
+    tab.minimize(False)
+    steps, events = _answers(IntegerClassifier(model), read)
+    assert len(steps) > 2000 and len(events) > 20
+    assert tab.run("answers.filter((a) => a[1] === 'tracking')") == steps
+    assert [tuple(row) for row in tab.run("plushPage.run.log.map((row) => row.slice(2))")] == events
+    assert tab.run("plushPage.run.toy.counts().restarts") == 1
+    # What is shown is of now, and not of a minute ago.
+    tab.until(f"document.getElementById('counts').textContent.includes('Frames: {len(read)}.')")
+    tab.until("pictures > 0")
+    assert tab.run("events.children.length === Math.min(20, plushPage.run.spans.length)")
 
 
 @pytest.mark.exhaustive

@@ -75,22 +75,31 @@ class Program:
         Raises:
             ProgramError: for an exit status other than 0 (98 for a crash in an emulator), or a timeout.
         """
-        command = [*self.target.run, str(self.file)]
         where = f"The test program on {self.target.name}"
-        try:
-            with open(given or os.devnull, "rb") as file:
-                result = subprocess.run(
-                    command, cwd=self.file.parent, stdin=file, capture_output=True, timeout=timeout_s
-                )
-        except subprocess.TimeoutExpired:
-            raise ProgramError(f"{where} did not end within {timeout_s:g} s: it was stopped.", "") from None
-        except OSError as cause:
-            raise ToolError(f"{where} cannot be started with {command[0]}: {cause.strerror or cause}.") from None
-        if result.returncode != 0:
-            errors = result.stderr.decode(errors="replace").strip()
-            last = f" Its error: {_error_line(errors)}" if errors else ""
-            raise ProgramError(f"{where} ended with status {result.returncode} instead of 0.{last}", errors)
-        return result.stdout
+        command = [*self.target.run, str(self.file)]
+        return run_program(where, command, cwd=self.file.parent, given=given, timeout_s=timeout_s)
+
+
+def run_program(
+    where: str, command: Sequence[str], *, cwd: Path | None = None, given: Path | None = None, timeout_s: float
+) -> bytes:
+    """Run a command, with the file ``given`` as standard input, and return its standard output; errors name ``where``.
+
+    Raises:
+        ProgramError: for an exit status other than 0, or a timeout. ToolError: if it cannot be started.
+    """
+    try:
+        with open(given or os.devnull, "rb") as file:
+            result = subprocess.run(command, cwd=cwd, stdin=file, capture_output=True, timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        raise ProgramError(f"{where} did not end within {timeout_s:g} s: it was stopped.", "") from None
+    except OSError as cause:
+        raise ToolError(f"{where} cannot be started with {command[0]}: {cause.strerror or cause}.") from None
+    if result.returncode != 0:
+        errors = result.stderr.decode(errors="replace").strip()
+        last = f" Its error: {_error_line(errors)}" if errors else ""
+        raise ProgramError(f"{where} ended with status {result.returncode} instead of 0.{last}", errors)
+    return result.stdout
 
 
 def target_named(name: str) -> Target:
@@ -266,7 +275,7 @@ def _compile(command: Sequence[str], cwd: Path, name: str) -> None:
 def _error_line(output: str) -> str:
     """Return the first line of a tool's output that reports an error, else the last line."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
-    words = (" error:", "undefined reference", "multiple definition", "overflowed", "ERROR:")
+    words = (" error:", "undefined reference", "multiple definition", "overflowed", "ERROR:", "Error: ")
     matching = [line for line in lines if any(w in line for w in words) and not line.startswith("collect2")]
     return (matching or lines[-1:] or ["no output"])[0]
 

@@ -6,17 +6,17 @@ import base64
 import json
 import re
 import shutil
-import subprocess
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
-from plushsense.core.errors import ProgramError, ToolError
+from plushsense.core.errors import ToolError
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.sentences import Message
 from plushsense.core.templates import fill_text
 from plushsense.deploy.code import ModelFacts
+from plushsense.deploy.targets import run_program
 from plushsense.deploy.wasm import WEB
 from plushsense.live.reactions import load_reactions, reaction_names
 from plushsense.models.bundle import Bundle
@@ -132,19 +132,7 @@ def run_module(folder: Path, image: Path, cases: Path, *words: str, timeout_s: f
     if (engine := shutil.which(_ENGINE)) is None:
         raise ToolError("Node, which runs WebAssembly, is not installed here: install Debian's nodejs.")
     command = [engine, str(WEB / "run.mjs"), str((folder / MODULE).parent.resolve()), str(image), *words]
-    try:
-        with cases.open("rb") as given:
-            done = subprocess.run(command, stdin=given, capture_output=True, timeout=timeout_s)
-    except subprocess.TimeoutExpired:
-        raise ProgramError(f"The module in Node did not end within {timeout_s:g} s: it was stopped.", "") from None
-    if done.returncode != 0:
-        errors = done.stderr.decode(errors="replace").strip()
-        found = re.search(r"^\w*Error\b.*", errors, re.M)
-        raise ProgramError(
-            f"The module in Node ended with status {done.returncode}: {found[0] if found else 'it names no error'}",
-            errors,
-        )
-    return done.stdout
+    return run_program("The module in Node", command, given=cases, timeout_s=timeout_s)
 
 
 def web_cost(folder: Path, image: Path, cases: Path) -> WebCost:

@@ -496,14 +496,14 @@ function showEvents() {
 }
 
 /**
- * Show what has come: signals in sight 20 to 60 times a second, as often as takes 1 % of a core here, a third of what it takes in all;
+ * Show what has come: signals in sight 12 to 60 times a second, as often as takes 1 % of a core here, a third of what it takes in all;
  * texts twice a second and with each event. It is drawn as data arrive, and not with a frame of the screen: a canvas that is `desynchronized`
  * needs none, and without a graphics card a frame takes three times as long.
  */
 function draw() {
   const now = performance.now();
   if (document.hidden || now < due) return;
-  due = Math.max(due, now - 15) + Math.min(Math.max(100 * cost, 16.6), 50);
+  due = Math.max(due, now - 15) + Math.min(Math.max(100 * cost, 16.6), 80);
   drawSignals(now);
   if (++pictures % 16 === 0) shown.port2.postMessage(now); // arrives when the browser is done with the picture
   if (listed && now - textAt < 500) return;

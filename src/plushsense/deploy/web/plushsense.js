@@ -142,9 +142,7 @@ export class Toy {
   _begin(model) {
     const c = this._c;
     this._toy = this._room("toy", c.plush_toy_bytes());
-    const image = this._put("model", model);
-    const memory = this._memory(image);
-    this._done(c.plush_web_bind(this._toy, image.at, image.bytes, memory.at, memory.bytes));
+    this._done(c.plush_web_bind(this._toy, ...this._image("model", model)));
     /** @type {number} values of one reading */
     this.channels = c.plush_channels(this._toy);
     this._values = this._room("values", 4 * this.channels);
@@ -197,12 +195,14 @@ export class Toy {
     const bytes = new Uint8Array(given.slice());
     const at = this._room(name, bytes.length);
     new Uint8Array(this._c.memory.buffer).set(bytes, at);
-    return { at, bytes: bytes.length };
+    return [at, bytes.length];
   }
 
-  _memory(image) {
-    const bytes = this._c.plush_memory_bytes(image.at, image.bytes) >>> 0;
-    return { at: this._room("memory", bytes), bytes };
+  /** A model, and the memory that it needs: where they are, and of how many bytes. */
+  _image(name, model) {
+    const image = this._put(name, model);
+    const bytes = this._c.plush_memory_bytes(...image) >>> 0;
+    return [...image, this._room("memory", bytes), bytes];
   }
 
   _text(at) {
@@ -342,19 +342,15 @@ export class Toy {
 
   /** Run another model for the same channels; unless it can, the old one goes on. @param {Uint8Array|ArrayBuffer} model */
   swap(model) {
-    const other = this._other ? "model" : "other";
-    const image = this._put(other, model);
-    const memory = this._memory(image);
-    this._done(this._c.plush_swap(this._toy, image.at, image.bytes, memory.at, memory.bytes));
+    this._done(this._c.plush_swap(this._toy, ...this._image(this._other ? "model" : "other", model)));
     this._other = !this._other;
     this._model();
   }
 
   /** Use the last layer of one person, or with null the model's own again. @param {Uint8Array|ArrayBuffer|null} bytes */
   patch(bytes) {
-    const next = this._patched ? "patch" : "patch too";
-    const patch = bytes === null ? { at: 0, bytes: 0 } : this._put(next, bytes);
-    this._done(this._c.plush_patch(this._toy, patch.at, patch.bytes));
+    const patch = bytes === null ? [0, 0] : this._put(this._patched ? "patch" : "patch too", bytes);
+    this._done(this._c.plush_patch(this._toy, ...patch));
     if (bytes !== null) this._patched = !this._patched;
   }
 }
