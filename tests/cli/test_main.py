@@ -183,6 +183,11 @@ def test_a_learning_curve_stands_beside_the_evaluation(cli: Cli, dataset: Datase
         assert refused.status != 0 and why in refused.err
 
 
+def test_evaluate_says_what_the_preset_took(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    words = ("--arch", "v4_5", "--filters", "3,4", "--epochs", "1", "--split", "by-subject:2", "--out", tmp_path / "e")
+    assert "1 epoch, batches of 32, seed 0" in cli("evaluate", dataset.path, *words).out
+
+
 def test_trained_on_loops_scored_on_the_stream(cli: Cli, dataset: Dataset) -> None:
     found = cli("evaluate", dataset.path, *SMALL, "--train-context", "loop", "--json").json
     assert (found["train_context"], found["context"]) == ("loop", "stream")
@@ -203,7 +208,7 @@ def test_a_configuration_file_and_flags_over_it(cli: Cli, dataset: Dataset, tmp_
     out = tmp_path / "m.plush"
     assert len(cli("train", dataset.path, "--config", config, "--out", out, "--json").json["history"]) == 3
     said = cli("train", dataset.path, "--config", config, "--epochs", "2", "--out", out, "--force").out
-    assert "of 2 kept" in said
+    assert "of 2 kept, batches of 32" in said
     assert "reads the last 2.47 s (247 samples at 100 Hz), through kernels of 1.18 s (118)." in said
     assert cli("info", out, "--json").json["filters"] == [4, 4, 4]
 

@@ -51,6 +51,16 @@ def test_ints_of_16_bits_bring_no_warning(
         assert done.returncode == 0, done.stderr
 
 
+def test_the_times_of_a_buffer_need_32_bits(packages: Packages, needs: Callable[..., None], tmp_path: Path) -> None:
+    needs("avr-gcc")
+    out = packages["accel-3"][0]
+    # 8 x 9615 does not fit an int of 16 bits, and unsigned products wrap without a warning.
+    text = '#include "plush_fifo.h"\n_Static_assert(PLUSH_FIFO_MARK * PLUSH_FIFO_PERIOD_US / 1000u == 76, "wraps");\n'
+    words = ["avr-gcc", "-mmcu=atmega1284p", f"-I{out}", f"-I{out / 'examples/fifo'}", "-fsyntax-only", "-xc", "-"]
+    done = subprocess.run(words, input=text, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_model_is_aligned_without_extensions(
     packages: Packages, needs: Callable[..., None], tmp_path: Path
 ) -> None:

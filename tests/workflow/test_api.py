@@ -268,6 +268,14 @@ def test_a_file_under_two_labels_and_a_long_window_are_named(
     twice = ps.import_recordings(tmp_path / "R", tmp_path / "TWICE", layout="accel-3").dataset
     warn_of_files_twice(twice, twice.gestures, said.append)
     assert len(said) == 1 and "as two gestures" in said[0] and "P1/Slow_" in said[0] and "P1/Fast_" in said[0]
+    # Many copies are one line more.
+    for name in sorted((tmp_path / "R" / "P1").glob("Slow_*.csv")):
+        (tmp_path / "R" / "P2").mkdir(exist_ok=True)
+        (tmp_path / "R" / "P2" / name.name).write_bytes(name.read_bytes())
+    copies = ps.import_recordings(tmp_path / "R", tmp_path / "COPIES", layout="accel-3").dataset
+    said.clear()
+    warn_of_files_twice(copies, copies.gestures, said.append)
+    assert len(said) == 2 and "more recordings have the same file" in said[1]
 
     def of(symbol: str, window_s: float, context: str = "stream", padding: str = "stream") -> str:
         spec, found = WindowSpec(window_s=window_s, context=context), list[str]()

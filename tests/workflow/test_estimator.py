@@ -260,6 +260,15 @@ def test_a_classifier_of_cut_windows_is_a_bundle_that_reads_the_toy(
     assert '"tracking"' in ran.out
 
 
+def test_a_network_with_a_vector_layer_trains_as_evaluate_trains_it(dataset: Dataset) -> None:
+    windows = ps.cut_windows(dataset.with_inputs(dataset.layout.for_vectors()))
+    settings: dict[str, Any] = {"arch": "v4_5", "filters": (3, 4), "epochs": 1, "layout": dataset.layout.for_vectors()}
+    for given, batch in (({}, 32), ({"batch": 64}, 64), ({"preset": "search"}, 64)):
+        trained = ps.PlushClassifier(**settings, **given).fit(windows.x, windows.y).bundle_.provenance["training"]
+        tempo = "random-tempo:0.3" in trained.get("augment", ())
+        assert (trained["batch"], tempo) == (batch, "preset" not in given)
+
+
 def test_a_splitter_gives_the_folds_of_an_evaluation(dataset: Dataset) -> None:
     from sklearn.model_selection import cross_val_score
 

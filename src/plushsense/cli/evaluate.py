@@ -57,13 +57,14 @@ def run(args: argparse.Namespace) -> int:
             say("everything that is advised is used")
     content["report"] = str(write_report(out / PAGE, dataset, [out]))
     say(f"written: {out}")
-    emit(args, content, lines(content))
+    schedule = f"{plural(made.training.epochs, 'epoch')}, batches of {made.training.batch}"
+    emit(args, content, lines(content, schedule))
     say_advice(args.dataset, config.windows.window_s)
     return 0
 
 
-def lines(e: dict[str, Any]) -> list[str]:
-    """Format the scores of an evaluation as text: a row for each person, then the means."""
+def lines(e: dict[str, Any], schedule: str = "") -> list[str]:
+    """Format the scores of an evaluation as text, with its ``schedule``: a row for each person, then the means."""
     from plushsense.reports.wording import describe_confidence, describe_leakage, describe_learning
     from plushsense.scoring.metrics import METRICS, column_metrics
 
@@ -72,7 +73,8 @@ def lines(e: dict[str, Any]) -> list[str]:
     context = e["context"]
     if e["train_context"] != context:
         context += f" (trained on {e['train_context']})"
-    out.append(f"split {e['split']}, context {context}, seed {', '.join(map(str, e['seeds']))}\n")
+    seeds = ", ".join(map(str, e["seeds"]))
+    out.append(", ".join(filter(None, (f"split {e['split']}", f"context {context}", schedule, f"seed {seeds}\n"))))
     rows = [
         (s["subject"], s["windows"], s["recordings"], *(figure(s[k]) for k in (*names, "by_recording_accuracy")))
         for s in e["subjects"]

@@ -33,14 +33,14 @@ def run(args: argparse.Namespace) -> int:
         warn=warn,
     )
     bundle = done.save(args.out)
-    scores, int8 = done.scores, done.scores.int8
+    scores, int8, batch = done.scores, done.scores.int8, done.bundle.provenance["training"]["batch"]
     mark = "  [SIMULATION]" if scores.simulated else ""
     emit(
         args,
         {"bundle": str(bundle), "history": done.history, "scores": scores.to_json(), "decision": done.bundle.decision},
         [
             f"{bundle}: {done.bundle.arch.symbol}, {done.bundle.arch.parameters:,} parameters, "
-            f"epoch {scores.best_epoch} of {len(done.history)} kept{mark}",
+            f"epoch {scores.best_epoch} of {len(done.history)} kept, batches of {batch}{mark}",
             _reads(done.bundle),
             f"accuracy {figure(scores.accuracy)}, macro-F1 {figure(scores.macro_f1)} on {scores.windows} "
             f"windows of {scores.description}{_counted(scores)}.",

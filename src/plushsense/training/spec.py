@@ -192,7 +192,12 @@ PADDING: dict[str, str] = {"search": "stream", "loso": "stream", "people": "stre
 CONTEXT: dict[str, str] = {"search": "loop", "loso": "stream", "people": "stream", "paper": "rows"}
 
 
-def preset(name: str, **changes: Any) -> TrainSpec:
+def preset_for(name: str, has_vectors: bool) -> TrainSpec:
+    """Return a preset as it trains a network with a vector layer, or one without."""
+    return replace(PRESETS[name], **VECTOR_TRAINING) if has_vectors and name == "people" else PRESETS[name]
+
+
+def preset(name: str, has_vectors: bool = False, **changes: Any) -> TrainSpec:
     """Return the preset of a name with some settings changed; None keeps the preset's.
 
     Raises:
@@ -202,4 +207,5 @@ def preset(name: str, **changes: Any) -> TrainSpec:
     known = [*(f.name for f in fields(TrainSpec)), "turn_deg"]
     for key in changes:
         check_known(key, known, "training setting", ConfigError)
-    return PRESETS[name].changed(**{key: value for key, value in changes.items() if value is not None})
+    usual = preset_for(name, has_vectors)
+    return usual.changed(**{key: value for key, value in changes.items() if value is not None})

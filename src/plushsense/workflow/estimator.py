@@ -19,7 +19,7 @@ from plushsense.core.gestures import Gesture, GestureSet, plain_label
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Channel, CsvFormat, Layout, load_layout
 from plushsense.core.version import __version__
 from plushsense.deploy.quantize import calibration
-from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch, symbol_at_rate, symbol_within
+from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch, parse_symbol, symbol_at_rate, symbol_within
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
@@ -398,9 +398,11 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             listed = ", ".join(map(str, classes))
             raise ArrayError(f"y has {len(classes)} class with a weight ({listed}): a classifier needs at least two.")
         numbers = {name: _python_number(getattr(self, name)) for name in ("epochs", "batch", "learning_rate")}
-        spec = preset(self.preset, **numbers, seed=_seed(self.random_state))
         layout = layout or anonymous_layout(x)
-        arch = self._network(x.shape[1], len(classes), x.shape[2], layout.rate_hz)
+        symbol = self._symbol(x.shape[2], layout.rate_hz)
+        has_vectors = parse_symbol(symbol).vector is not None
+        spec = preset(self.preset, has_vectors, **numbers, seed=_seed(self.random_state))
+        arch = self._network(symbol, x.shape[1], len(classes), x.shape[2])
         x = to_integers(x, layout)
         order = in_own_order(x, index, *([people] if groups is not None else []))
         x, index, weights = x[order], index[order].astype(np.int64), weights[order]
@@ -548,9 +550,8 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             return self.layout
         return load_layout(self.layout if isinstance(self.layout, str) else Path(self.layout))
 
-    def _network(self, channels: int, classes: int, samples: int, rate_hz: float) -> Arch:
-        """Return the network for windows of (C, T); raise ArrayError if they are too short for it."""
-        padding = PADDING[self.preset] if self.padding is None else self.padding
+    def _symbol(self, samples: int, rate_hz: float) -> str:
+        """Return the symbol of the network for windows of ``samples``; the default one is shortened if needed."""
         symbol = symbol_at_rate(DEFAULT_SYMBOL, rate_hz) if self.arch is None else self.arch
         if self.arch is None and (shorter := symbol_within(symbol, samples)) != symbol:
             shorter = symbol_within(symbol, max(samples // 2, min(samples, _SHORTEST_FIELD)))
@@ -561,6 +562,11 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
                 stacklevel=3,
             )
             symbol = shorter
+        return symbol
+
+    def _network(self, symbol: str, channels: int, classes: int, samples: int) -> Arch:
+        """Return the network for windows of (C, T); raise ArrayError if they are too short for it."""
+        padding = PADDING[self.preset] if self.padding is None else self.padding
         arch = Arch.parse(
             symbol,
             self.filters,

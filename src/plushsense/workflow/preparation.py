@@ -34,7 +34,7 @@ from plushsense.models.arch import (
 from plushsense.reports.table import text
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
-from plushsense.training.spec import ANYWHERE_EPOCHS, PADDING, PRESETS, VECTOR_TRAINING, TrainSpec
+from plushsense.training.spec import ANYWHERE_EPOCHS, PADDING, PRESETS, VECTOR_TRAINING, TrainSpec, preset_for
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
 from plushsense.windows.cut import (
     ANYWHERE,
@@ -132,7 +132,7 @@ class Run:
 
         The symbol of the network, its filters and padding, the context and the seed are left out.
         """
-        training = preset_for(self.preset, self.trained_on.context, self.network.vector is not None)
+        training = _usual(self.preset, self.trained_on.context, self.network.vector is not None)
         usual = {
             "windows": asdict(WindowSpec()),
             "model": asdict(ModelSpec()),
@@ -169,14 +169,11 @@ def _outcome_of(training: TrainSpec) -> dict[str, Any]:
     return {key: value for key, value in training.key().items() if key not in ("device", "threads")}
 
 
-def preset_for(name: str, context: str, has_vectors: bool) -> TrainSpec:
+def _usual(name: str, context: str, has_vectors: bool) -> TrainSpec:
     """Return a preset as it trains a network, with a vector layer or without, on windows of a context."""
-    usual = PRESETS[name]
-    if not has_vectors:
-        return usual
-    if name == "people":
-        usual = replace(usual, **VECTOR_TRAINING)
-    return usual.with_epochs(ANYWHERE_EPOCHS.get(name, usual.epochs)) if context == ANYWHERE else usual
+    usual = preset_for(name, has_vectors)
+    fewer = has_vectors and context == ANYWHERE
+    return usual.with_epochs(ANYWHERE_EPOCHS.get(name, usual.epochs)) if fewer else usual
 
 
 def with_preset(config: RunConfig, symbol: str) -> RunConfig:
@@ -186,7 +183,7 @@ def with_preset(config: RunConfig, symbol: str) -> RunConfig:
     """
     has_vectors = parse_symbol(symbol).vector is not None
     context = config.evaluation.train_context or config.windows.context
-    usual = preset_for(config.preset, context, has_vectors)
+    usual = _usual(config.preset, context, has_vectors)
     keys, plain = (*VECTOR_TRAINING, "epochs", "halve_every"), PRESETS[config.preset]
     given = config.given | {key for key in keys if getattr(config.training, key) != getattr(plain, key)}
     # The learning rate falls with the epochs.
@@ -400,18 +397,26 @@ def warn_of_files_twice(dataset: Dataset, gestures: GestureSet, warn: Warn) -> N
     for recording in dataset.used:
         if recording.gesture in gestures.labels:
             same.setdefault((recording.sha256, recording.first_row, recording.rows), []).append(recording)
-    for first, *others in same.values():
-        for other in others:
-            labels = {first.gesture, other.gesture}
-            known = "as two gestures" if len(labels) == 2 else f"twice as '{first.gesture}'"
-            warn(
-                Message(
-                    "the same file is in the data set {known}: {first} and {second}; exclude one of them",
-                    known=known,
-                    first=first.id,
-                    second=other.id,
-                )
+    pairs = [(first, other) for first, *others in same.values() for other in others]
+    pairs.sort(key=lambda pair: pair[0].gesture == pair[1].gesture)
+    for first, other in pairs[:1]:
+        alike = first.gesture == other.gesture
+        warn(
+            Message(
+                "the same file is in the data set {known}: {first} and {second}; exclude one of them",
+                known=f"twice as '{first.gesture}'" if alike else "as two gestures",
+                first=first.id,
+                second=other.id,
             )
+        )
+    if len(pairs) > 1:
+        warn(
+            Message(
+                "{n} more recordings have the same file as another one: plushsense check names them, and "
+                '--exclude duplicate: --why "..." leaves them out',
+                n=len(pairs) - 1,
+            )
+        )
 
 
 _LOOPED_WINDOWS = (

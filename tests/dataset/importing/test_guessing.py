@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import tomllib
 from dataclasses import replace
@@ -540,6 +541,63 @@ def test_xdf_without_names_and_without_markers(tmp_path: Path, xdf_writer: Any, 
     assert (seen.recordings, seen.gestures, seen.subjects) == (12, {"hug": 6, "tap": 6}, ["ann", "bob", "cy"])
     with pytest.raises(FileFormatError, match="no stream of numbers"):
         guess_pattern(xdf_writer(tmp_path / "cues.xdf", [cues(xdf_stream, "Cues", "hug", "end")]))
+
+
+def test_numbers_of_an_xdf_are_labels_where_no_texts_are(tmp_path: Path, xdf_writer: Any, xdf_stream: Any) -> None:
+    codes = xdf_stream("Trig", [0.5 + k for k in range(4)], [[1], [0], [7], [0]], format="int32", rate=0.0)
+    heart = xdf_stream("Heart", [0.3 + k for k in range(5)], [[60.5 + k] for k in range(5)], rate=0.0)
+    marks = cues(xdf_stream, "Cues", "hug", "end")
+    for seed, person in enumerate(PEOPLE):
+        glove = stream(xdf_stream, "Glove", seed, "force", "bend")
+        xdf_writer(tmp_path / "src" / person / "a.xdf", [glove, heart, codes])
+        xdf_writer(tmp_path / "texts" / person / "a.xdf", [glove, heart, codes, marks])
+    found, guess, seen = guessed(tmp_path / "src")
+    assert found["columns"] == {"markers": "Trig"} and seen.gestures == {"1": 3, "7": 3}
+    assert any("has the numbers 1, 7" in doubt for doubt in guess.doubts)
+    pattern = replace(guess.pattern, aliases={"hug": ("1",), "tap": ("7",)})
+    assert preview_import(tmp_path / "src", pattern=pattern).gestures == {"hug": 3, "tap": 3}
+    assert set(guess_pattern(tmp_path / "texts").labels) == {"hug"}
+
+
+def test_compressed_xdf_beside_others_is_taken_too(tmp_path: Path, xdf_writer: Any, xdf_stream: Any) -> None:
+    marks = cues(xdf_stream, "Cues", "hug", "end")
+    for seed, person in enumerate(PEOPLE):
+        glove = stream(xdf_stream, "Glove", seed, "force", "bend")
+        plain = xdf_writer(tmp_path / "src" / person / "one.xdf", [glove, marks])
+        later = xdf_writer(tmp_path / "two.xdf", [stream(xdf_stream, "Glove", seed + 9, "force", "bend"), marks])
+        with gzip.open(plain.with_name("two.xdf.gz"), "wb") as packed:
+            packed.write(later.read_bytes())
+    found, guess, seen = guessed(tmp_path / "src")
+    assert found["paths"] == ["{subject}/*.xdf", "{subject}/*.xdf.gz"]
+    assert (seen.recordings, seen.subjects) == (6, list(PEOPLE))
+    assert not any("left out" in doubt for doubt in guess.doubts)
+
+
+def test_channels_of_one_name_are_said_at_the_guess(tmp_path: Path, xdf_writer: Any, xdf_stream: Any) -> None:
+    marks = cues(xdf_stream, "Cues", "hug", "end", "tap", "end")
+    for seed, person in enumerate(PEOPLE):
+        glove = stream(xdf_stream, "Glove", seed, "force", "bend", "Bend")
+        xdf_writer(tmp_path / "src" / person / "a.xdf", [glove, marks])
+    found, guess, seen = guessed(tmp_path / "src")
+    assert names(found) == ["force"] and seen.recordings == 6
+    assert any("several channels have the name bend, Bend" in doubt for doubt in guess.doubts)
+    glove = stream(xdf_stream, "Glove", 1, "force", "force")
+    with pytest.raises(FileFormatError, match="several channels of the stream 'Glove' are called 'force'"):
+        guess_pattern(xdf_writer(tmp_path / "all.xdf", [glove, marks]))
+
+
+@pytest.mark.usefixtures("parquet")
+def test_columns_of_parquet_that_are_left_out_are_said(tmp_path: Path) -> None:
+    import polars as pl
+
+    for seed, person in enumerate(PEOPLE):
+        (tmp_path / "src" / person).mkdir(parents=True)
+        force = noise(120, seed)
+        frame = {"force": force, "imu": [{"x": value, "y": 1} for value in force], "label": ["hug", "tap"] * 60}
+        pl.DataFrame(frame).write_parquet(tmp_path / "src" / person / "all.parquet")
+    found, guess, _ = guessed(tmp_path / "src")
+    assert names(found) == ["force"]
+    assert any("the cells of imu are neither values" in doubt for doubt in guess.doubts)
 
 
 @pytest.mark.usefixtures("parquet")

@@ -714,6 +714,7 @@ def test_rest_with_a_label_of_its_own_tells_the_gesture_of_a_file(tmp_path: Path
     for person in range(3):
         for kind, name in enumerate(("press", "wipe", "tap")):
             touch = np.repeat([0.0, 1.0] * 4, 60)[:, None] * rng.normal(30, 8, (480, 3))
+            touch *= np.tile(1 + np.sin(np.linspace(0, 12, 60)), 8)[:, None]
             values = 400 + 60 * kind + rng.normal(0, 2, (480, 3)) + touch
             rows = ["time_ms,a,b,c,label"]
             rows += [
@@ -722,6 +723,9 @@ def test_rest_with_a_label_of_its_own_tells_the_gesture_of_a_file(tmp_path: Path
             ]
             (tmp_path / f"SRC/P{person}").mkdir(parents=True, exist_ok=True)
             (tmp_path / f"SRC/P{person}/{name}.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    done = import_recordings(tmp_path / "SRC", tmp_path / "DS", pattern=guess_pattern(tmp_path / "SRC").pattern)
-    found = check(done.dataset, only=["rest-tells"]).findings
-    assert [float(str(f.message).split("tells ")[1].split()[0]) > 80 for f in found] == [True]
+    pattern = guess_pattern(tmp_path / "SRC").pattern
+    # With an idle label, rest is only in the stream.
+    for name, idle in (("DS", ()), ("IDLE", ("rest",))):
+        done = import_recordings(tmp_path / "SRC", tmp_path / name, pattern=replace(pattern, idle=idle))
+        found = check(done.dataset, only=["rest-tells"]).findings
+        assert [float(str(f.message).split("tells ")[1].split()[0]) > 80 for f in found] == [True], name

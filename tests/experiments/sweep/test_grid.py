@@ -13,6 +13,7 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import load_layout
 from plushsense.experiments.sweep.grid import FULL, GRIDS, GridSpec, load_grid, networks, problems
 from plushsense.models.arch import PAPER_ARCHITECTURES, Arch
+from plushsense.training.spec import VECTOR_TRAINING
 
 PLUSH = load_layout("plush-15")
 PAPER = GRIDS["paper"]
@@ -40,6 +41,13 @@ def test_the_scripts_grid_trains_as_the_authors_do() -> None:
     spec = grid.training
     assert (spec.learning_rate, spec.halve_every, spec.patience) == (0.001, None, None)
     assert (spec.scaling, spec.weight_decay, grid.norm, grid.split) == ("none", 1e-4, "layer", "windows:file-order")
+
+
+def test_networks_with_a_vector_layer_train_as_evaluate_trains_them() -> None:
+    grid = replace(GRIDS["people"], architectures=("v14_17d2_19d4",))
+    assert grid.training.augment == VECTOR_TRAINING["augment"] != GRIDS["people"].training.augment
+    assert replace(grid, augment=("random-gain:0.2",)).training.augment == ("random-gain:0.2",)
+    assert replace(grid, preset="search").training.augment == ()
 
 
 @pytest.mark.parametrize(

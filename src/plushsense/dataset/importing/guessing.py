@@ -60,7 +60,7 @@ from plushsense.dataset.importing.table_files import (
     parquet_columns,
     parquet_objects,
 )
-from plushsense.dataset.importing.xdf import XdfSample, is_xdf, sample_xdf
+from plushsense.dataset.importing.xdf import XdfSample, is_xdf, sample_xdf, xdf_stem
 
 _FILES, _LINES, _FEW = 12, 2000, 5
 _HEAD, _MOST_BYTES, _MOST_JSON = 16_384, 400_000, 64 << 20
@@ -145,9 +145,9 @@ def _tables(source: Path, found: Iterable[Path], given: GuessSpec) -> tuple[list
         )
     sizes: Counter[str] = Counter()
     for file in files:
-        sizes[file.suffix.lower()] += file.stat().st_size
+        sizes[_ending(file)] += file.stat().st_size
     ending = sizes.most_common(1)[0][0]
-    of_ending = [f for f in files if f.suffix.lower() == ending]
+    of_ending = [f for f in files if _ending(f) == ending]
     mine = [f for f in of_ending if _has_rows(f)]
     if not mine:
         raise DatasetError(
@@ -161,6 +161,11 @@ def _tables(source: Path, found: Iterable[Path], given: GuessSpec) -> tuple[list
             "'{source}' holds recordings of the GestureRecorder: import it without a pattern.", source=source
         )
     return mine, of_ending, len(files) - len(of_ending), ending
+
+
+def _ending(path: Path) -> str:
+    """Return the ending of a file's name, ``.xdf`` for all of XDF, compressed or not."""
+    return ".xdf" if is_xdf(path) else path.suffix.lower()
 
 
 def _sample(files: list[Path]) -> list[Path]:
@@ -185,7 +190,15 @@ def _columns(
         there = {file: parquet_columns(file) for file in files}
         usual = Counter(filter(None, there.values())).most_common(1)
         files = [file for file in files if usual and there[file] == usual[0][0]] or files
-        return _json_columns([parquet_objects(f, _LINES) for f in _sample(files)], guess), files
+        objects = [parquet_objects(f, _LINES) for f in _sample(files)]
+        kept = {name for rows in objects for _, row in rows[:1] for name in row}
+        if kept and (nested := [name for name in there[files[0]] if name not in kept]):
+            guess.doubt(
+                "the cells of {listed} are neither values nor lists of values: they are left out",
+                "channels",
+                listed=", ".join(nested[:_FEW]),
+            )
+        return _json_columns(objects, guess), files
     columns = _text_columns([lines for f in some if (lines := _text(f, guess).splitlines()[:_LINES])], guess)
     return columns, [f for f in files if _fits(_text(f, None, _HEAD).splitlines(), guess)] or files
 
@@ -248,12 +261,16 @@ def _paths(base: Path, mine: list[Path], without: list[Path], ending: str, guess
     of_labels = _interval_files(base, without, guess)
     taken = guess.taken | ({"label"} if of_labels else set())
     stated = guess.given.parts
-    parts = guess_paths(relative, ending, taken, set(guess.labels), dotted=INTERVAL in guess.columns, stated=stated)
+    named, endings = relative, [ending]
+    if is_xdf(mine[0]):
+        named = [path.with_name(xdf_stem(path) + ending) for path in relative]
+        endings = sorted({path.name[len(xdf_stem(path)) :].lower() for path in relative})
+    parts = guess_paths(named, ending, taken, set(guess.labels), dotted=INTERVAL in guess.columns, stated=stated)
     if of_labels and _intervals(of_labels, relative, parts, guess):
         without = [file for file in without if file.relative_to(base) not in of_labels]
     elif of_labels:
-        parts = guess_paths(relative, ending, guess.taken, stated=stated)
-    guess.keys["paths"] = parts.patterns
+        parts = guess_paths(named, ending, guess.taken, stated=stated)
+    guess.keys["paths"] = [text.removesuffix(ending) + each for text in parts.patterns for each in endings]
     _exclude([f.relative_to(base) for f in without], relative, guess)
     return parts
 
@@ -507,8 +524,24 @@ def _xdf_columns(files: list[Path], guess: PatternDraft, limits: UnpackLimits) -
             name=first.stream,
             others=", ".join(first.others[:_FEW]),
         )
-    if first.other_markers:
+    if first.repeated:
+        guess.doubt(
+            "several channels have the name {listed}, so that they cannot be told apart: they are left out",
+            "channels",
+            listed=", ".join(first.repeated[:_FEW]),
+        )
+    are_codes = bool(first.labels) and all(map(is_number, first.labels))
+    if first.other_markers or are_codes:
         guess.columns[MARKERS_ROLE] = first.markers
+    if are_codes:
+        guess.doubt(
+            "the stream '{name}' has the numbers {listed}, which are taken for the labels: give them names in "
+            "[aliases]",
+            "label",
+            name=first.markers,
+            listed=", ".join(sorted(set(first.labels))[:_FEW]),
+        )
+    if first.other_markers:
         guess.doubt(
             "the labels are those of the stream '{name}'; there are also {others}: if one of them names the gestures, "
             "name it as markers under [columns]",
@@ -516,7 +549,7 @@ def _xdf_columns(files: list[Path], guess: PatternDraft, limits: UnpackLimits) -
             name=first.markers,
             others=", ".join(first.other_markers[:_FEW]),
         )
-    elif first.labels:
+    elif first.labels and not are_codes:
         listed = ", ".join(repr(label) for label in list(dict.fromkeys(first.labels))[:2])
         guess.doubt("the stream '{name}' names the labels: {listed}", "label", name=first.markers, listed=listed)
     columns = [SampledColumn(key, key, [sample.columns[key] for sample in alike]) for key in usual]

@@ -14,6 +14,7 @@ import re
 import shlex
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,6 +52,8 @@ _BIDS = re.compile(r"(?:^|_)(sub|ses|run)-([^_]+)")
 _CHUNK = 1 << 20
 # Values in a stream of numbers without a rate that may be markers.
 _MOST_EVENTS = 100_000
+# Different values of a stream of numbers that may be codes of gestures.
+_MOST_CODES = 20
 # A stream of numbers with fewer samples is rather one of markers.
 _MOST_MARKERS = 50
 _FEWEST_SAMPLES = 3
@@ -109,7 +112,8 @@ def is_xdf(path: Path) -> bool:
     return path.name.lower().endswith(XDF_ENDINGS)
 
 
-def _stem(path: Path) -> str:
+def xdf_stem(path: Path) -> str:
+    """Return the name of an XDF file without its ending, which may have two parts."""
     return next((path.name[: -len(end)] for end in XDF_ENDINGS if path.name.lower().endswith(end)), path.stem)
 
 
@@ -118,8 +122,8 @@ def person_and_session(path: Path, folder: str | None) -> tuple[str | None, str]
 
     If the name lacks them, the person is ``folder`` (None if unknown), and the session the name of the file.
     """
-    entities = dict(_BIDS.findall(_stem(path)))
-    session = "-".join(entities[key] for key in ("ses", "run") if key in entities) or _stem(path)
+    entities = dict(_BIDS.findall(xdf_stem(path)))
+    session = "-".join(entities[key] for key in ("ses", "run") if key in entities) or xdf_stem(path)
     return entities.get("sub", folder), session
 
 
@@ -246,14 +250,16 @@ class XdfSample:
     Attributes:
         stream: name of the stream that may be the toy, and ``others`` of further ones.
         columns: some values of each of its channels, as texts, and ``time_ms``; none of channels that are named as a
-            time, a person or the like.
-        markers: name of the stream of markers that may name gestures, and ``other_markers`` of further ones.
+            time, a person or the like, and of those of one name, which are ``repeated``.
+        markers: name of the stream of markers that may name gestures, and ``other_markers`` of further ones. Numbers
+            are markers only where no texts are.
         labels: what its markers name.
     """
 
     stream: str
     others: tuple[str, ...]
     columns: dict[str, list[str]]
+    repeated: tuple[str, ...]
     markers: str
     other_markers: tuple[str, ...]
     labels: list[str]
@@ -266,7 +272,7 @@ def sample_xdf(path: Path, rows: int, folder: Path, limits: UnpackLimits) -> Xdf
         folder: a new folder, for the content of a compressed file.
 
     Raises:
-        FileFormatError: for a damaged file, or one without a stream of numbers.
+        FileFormatError: for a damaged file, or one without a stream of numbers whose channels can be told apart.
         MissingExtraError: without pyxdf.
     """
     plain = uncompressed(path, folder, limits)
@@ -282,16 +288,38 @@ def sample_xdf(path: Path, rows: int, folder: Path, limits: UnpackLimits) -> Xdf
     if len(labels) != samples.shape[1] or not all(labels):
         labels = [f"c{k + 1}" for k in range(samples.shape[1])]
     columns = {"time_ms": [f"{1000.0 * time:.3f}" for time in toy.times_s[:rows].tolist()]}
+    counts = Counter(label.casefold() for label in labels)
+    repeated = tuple(dict.fromkeys(label for label in labels if counts[label.casefold()] > 1))
     for label, values in zip(labels, samples.T, strict=True):
-        if not any(label.casefold() in names for names in ROLES.values()):
+        if label not in repeated and not any(label.casefold() in names for names in ROLES.values()):
             columns[label] = [str(value) if np.isfinite(value) else "" for value in values]
-    read = _read_markers([s for s in streams if s.is_text], None)
-    named = {s.name: found for s in streams if (found := [m.label for m in read.get(s.number, ()) if m.label])}
+    if len(columns) == 1 and repeated:
+        raise FileFormatError(
+            "'{file}': several channels of the stream '{stream}' are called '{label}': give each a name of its own",
+            file=path.name,
+            stream=toy.name,
+            label=repeated[0],
+        )
+    named = _labels_of([s for s in streams if s.is_text]) or _labels_of([s for s in streams if _has_codes(s)])
     markers = MARKERS if MARKERS in named else max(named, key=lambda name: len(named[name]), default="")
-    others = tuple(s.name for s in numbers if s is not toy)
+    others = tuple(s.name for s in numbers if s is not toy and s.name != markers)
     other_markers = tuple(name for name in named if name != markers)
     name = f"#{toy.number}" if toy.name in others else toy.name
-    return XdfSample(name, others, columns, markers, other_markers, named.get(markers, []))
+    return XdfSample(name, others, columns, repeated, markers, other_markers, named.get(markers, []))
+
+
+def _labels_of(streams: Sequence[XdfStream]) -> dict[str, list[str]]:
+    """Return the labels that the markers in each stream name, by its name; only of streams that name some."""
+    read = _read_markers(streams, None)
+    return {s.name: labels for s in streams if (labels := [m.label for m in read.get(s.number, ()) if m.label])}
+
+
+def _has_codes(stream: XdfStream) -> bool:
+    """Return whether a stream holds single whole numbers at irregular times, few of them different."""
+    if stream.is_text or not stream.is_irregular or not 0 < stream.samples.size == len(stream.times_s) <= _MOST_EVENTS:
+        return False
+    values = np.unique(stream.samples)
+    return bool(len(values) <= _MOST_CODES and np.isfinite(values).all() and (values == np.rint(values)).all())
 
 
 def _joined(streams: Sequence[XdfStream]) -> tuple[XdfStream, str] | None:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import BINARY, COUNT
@@ -590,29 +591,61 @@ def one_session(w: DatasetSummary) -> Iterator[Issue]:
             yield Issue(Message(template, gesture=gesture, session=f"{subject}/{session}".strip("/")))
 
 
+_Placed = dict[str, list[tuple[int, int]]]
+
+
+def _placed(w: DatasetSummary) -> _Placed:
+    """Return the rows of each stream in which there is a recording."""
+    placed: _Placed = {}
+    for o in w.recordings:
+        if isinstance(o.info, RecordingInfo) and o.info.stream_row >= 0:
+            rows = o.info.stream_row + o.info.start, o.info.stream_row + o.info.stop
+            placed.setdefault(o.info.stream, []).append(rows)
+    return placed
+
+
+def _before(w: DatasetSummary, o: RecordingSummary, placed: _Placed) -> NDArray[np.float64] | None:
+    """Return the mean of the 0.3 s before a recording in its stream, (C,); None where these are in another one."""
+    info, rows = o.info, START_HOPS * o.hop
+    if not isinstance(info, RecordingInfo) or info.stream_row < 0 or info.stream_row + info.start < rows:
+        return None
+    first = info.stream_row + info.start - rows
+    if any(begin < first + rows and end > first for begin, end in placed[info.stream]):
+        return None
+    values = w.dataset.read_stream(info.stream).values[first : first + rows]
+    clipped = np.clip(values, w.dataset.layout.valid_min_int, w.dataset.layout.valid_max_int)
+    return np.asarray(clipped.mean(axis=0))
+
+
 def rest_tells(w: DatasetSummary) -> Iterator[Issue]:
     """Report whether the rest before the touch already tells the gesture: a control that should only guess.
 
     Each recording that begins at rest gets the gesture of the one with the most similar mean of its first 0.3 s, among
     those of other people, or of all if only one person has such recordings. A recording that is at rest throughout
-    counts for the gesture of its session, if that has only one.
+    counts for the gesture of its session, if that has only one. In a session of one gesture, other recordings count
+    with the 0.3 s before them in the stream.
     """
     peaks = [float(np.percentile(a, 95)) if len(a := w.activity(o)) else 0.0 for o in w.recordings]
     made: dict[tuple[str, str], set[str]] = {}
+    held: dict[tuple[str, str], set[str]] = {}
     for o, peak in zip(w.recordings, peaks, strict=True):
-        if peak >= _SOMETHING:
-            made.setdefault((o.info.subject, o.info.session), set()).add(gesture_of(o))
-    rests: list[tuple[RecordingSummary, str]] = []
+        for sessions in (held, made)[: 2 if peak >= _SOMETHING else 1]:
+            sessions.setdefault((o.info.subject, o.info.session), set()).add(gesture_of(o))
+    placed = _placed(w)
+    rests: list[tuple[RecordingSummary, str, NDArray[np.float64]]] = []
     for o, peak in zip(w.recordings, peaks, strict=True):
-        alone = made.get((o.info.subject, o.info.session), set())
+        place = o.info.subject, o.info.session
+        alone = made.get(place, set())
         if peak >= _SOMETHING and w.activity(o)[:START_HOPS].max() < _QUIET * peak:
-            rests.append((o, gesture_of(o)))
+            rests.append((o, gesture_of(o), o.start))
         elif peak < _SOMETHING and len(alone) == 1:
-            rests.append((o, next(iter(alone))))
-    gesture, subject = np.array([label for _, label in rests]), np.array([o.info.subject for o, _ in rests])
+            rests.append((o, next(iter(alone)), o.start))
+        elif len(held[place]) == 1 and (before := _before(w, o, placed)) is not None:
+            rests.append((o, gesture_of(o), before))
+    gesture, subject = np.array([label for _, label, _ in rests]), np.array([o.info.subject for o, _, _ in rests])
     if len(rests) < _RESTS or len(set(gesture.tolist())) < 2:
         return
-    start = np.array([o.start for o, _ in rests])
+    start = np.array([mean for _, _, mean in rests])
     start /= np.maximum(start.std(axis=0), 1e-9)
     apart = subject[:, None] != subject if len(set(subject.tolist())) > 1 else ~np.eye(len(rests), dtype=bool)
     right = [

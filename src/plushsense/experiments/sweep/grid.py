@@ -36,7 +36,7 @@ from plushsense.models.arch import (
     symbol_within,
 )
 from plushsense.scoring.splits import parse_split
-from plushsense.training.spec import DEVICES, PRESETS, TrainSpec
+from plushsense.training.spec import DEVICES, PRESETS, TrainSpec, preset
 from plushsense.windows.cut import CONTEXTS, WindowSpec
 
 FULL: Literal["full"] = "full"
@@ -147,7 +147,9 @@ class GridSpec:
     def training(self) -> TrainSpec:
         """Training settings; epochs, batch and seed differ by training and are set in the plan."""
         changes = {key: getattr(self, key) for key in GRID_TRAINING if getattr(self, key) is not None}
-        return PRESETS[self.preset].changed(device=self.device, threads=self.threads, **changes)
+        # All networks of a grid have a vector layer, or none.
+        has_vectors = any(parse_symbol(symbol).vector is not None for symbol in self.architectures)
+        return preset(self.preset, has_vectors, device=self.device, threads=self.threads, **changes)
 
     @property
     def windows(self) -> WindowSpec:

@@ -18,7 +18,7 @@ extern "C" {
 #ifndef PLUSH_FIFO_PERIOD_US
 #define PLUSH_FIFO_PERIOD_US 9615u /* between two readings, by the data sheet: 104 Hz */
 #endif
-#define PLUSH_FIFO_MARK 8u  /* readings in the buffer at which the interrupt comes */
+#define PLUSH_FIFO_MARK ((uint32_t)8) /* readings in the buffer at which the interrupt comes */
 #define PLUSH_FIFO_MOST 32u /* that it holds; then it must stop, not leave out the oldest */
 
 /* Yours to write: how many readings are in the buffer, and the oldest one out of it, with the scale of the
