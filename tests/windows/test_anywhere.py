@@ -176,6 +176,16 @@ def test_a_session_with_a_recording_nobody_located_gives_no_idleness(tmp_path: P
     assert newest(cut_anywhere(data, SPEC, data.gestures, EVERY), "Still") == []
 
 
+def test_a_stream_of_which_every_recording_is_left_out_is_left_out(tmp_path: Path) -> None:
+    for name in ("ana", "bob"):
+        person(tmp_path / "src" / name, {(500, 200): "Wave"})
+    data = made(tmp_path)
+    assert set(cut_anywhere(data, SPEC, data.gestures, EVERY).subject) == {"ana", "bob"}
+    append_marks(data.path, [Mark(next(r.id for r in data.recordings if r.subject == "bob"), "exclude", "test", "no")])
+    again = open_dataset(data.path)
+    assert set(cut_anywhere(again, SPEC, again.gestures, EVERY).subject) == {"ana"}
+
+
 def test_a_recording_with_which_the_stream_begins_has_its_place(tmp_path: Path) -> None:
     person(tmp_path / "src" / "ana", {(0, 200): "Wave"}, rows=500)
     data = made(tmp_path)
