@@ -123,6 +123,22 @@ def test_what_a_faster_window_lacks_is_held_at_its_beginning() -> None:
     assert bool(faster.any()) and bool((out[faster][:, :20] == 0.0).all())
 
 
+def test_tempo_and_warp_are_played_in_one_pass() -> None:
+    x = torch.arange(200.0)[None, None].expand(100, 1, 200).contiguous()
+    channels = Channels((), Scaler(np.zeros(1), np.ones(1)), torch.device("cpu"))
+    both = augmentations(["random-tempo:0.3", "random-warp:0.4"], channels)
+    tempo, warp = (augmentations([name], channels) for name in ("random-tempo:0.3", "random-warp:0.4"))
+    assert both is not None and tempo is not None and warp is not None
+    random = torch.Generator().manual_seed(0)
+    in_turn = warp(tempo(x, random), random)[:, 0]
+    at_once = both(x, torch.Generator().manual_seed(0))[:, 0]
+    # Near the beginning, each pass in turn may hold a sample.
+    moving = in_turn[:, 1:] > in_turn[:, :-1] + 0.01
+    assert float(moving.float().mean()) > 0.8
+    equal = (at_once - in_turn)[:, 1:][moving].abs() < 0.01
+    assert float(equal.float().mean()) > 0.98
+
+
 def test_gain_and_tilt_need_gravity() -> None:
     channels = Channels(((0, 1, 2),), Scaler(np.zeros(3), np.ones(3)), torch.device("cpu"))
     assert augmentations(["random-gain:0.3", "random-tilt:8"], channels) is None

@@ -33,9 +33,16 @@ def test_a_preset_takes_changes() -> None:
     json.dumps(preset("people").to_dict())
 
 
+def test_only_our_preset_leaves_out_positions_and_ids_of_the_others_stay() -> None:
+    assert {name for name, spec in PRESETS.items() if spec.stride > 1} == {"people"}
+    assert preset("people").to_dict()["stride"] == 4
+    assert "stride" not in preset("paper").to_dict() and "stride" not in preset("people", stride=1).to_dict()
+
+
 @pytest.mark.parametrize(
     ("name", "changes", "says"),
     [
+        ("people", {"stride": 0}, "stride is 0: accepted are whole numbers from 1"),
         ("los", {}, "Did you mean 'loso'"),
         ("loso", {"epoch": 3}, "Did you mean 'epochs'"),
         ("loso", {"epochs": 0}, "epochs is 0: accepted are whole numbers from 1"),

@@ -9,7 +9,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.dataset.store import Dataset
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, VECTOR_FILTERS, VECTOR_SYMBOL, symbol_at_rate
 from plushsense.training.spec import VECTOR_TRAINING
-from plushsense.workflow.config import RunConfig, from_settings, resolve
+from plushsense.workflow.config import RunConfig, from_settings, from_stored, resolve
 from plushsense.workflow.preparation import network_for, prepare, prepare_training
 
 
@@ -64,3 +64,10 @@ def test_settings_that_differ_from_the_preset_stay_without_being_named(dataset: 
     made = prepare(dataset, replace(config, training=training)).training
     assert (made.batch, made.epochs, made.augment) == (16, 5, ("random-gain:0.1",))
     assert made.halve_every == config.training.halve_every
+
+
+def test_a_stored_evaluation_keeps_its_stride(dataset: Dataset) -> None:
+    for stride in (1, 2, 4):
+        stored = prepare(dataset, from_settings(stride=stride)).to_json()
+        assert from_stored(stored).training.stride == stride
+    assert prepare(dataset, from_settings()).training.stride == 4

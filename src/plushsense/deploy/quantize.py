@@ -115,17 +115,18 @@ class Ranges:
 
 def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
     """Measure the ranges of scaled training windows (N, C, T) in every layer of the network."""
-    axes, first = np.empty(0), np.asarray(x)
+    axes, first, inner = np.empty(0), np.asarray(x), None
     if network.vectors is not None:
         layer = network.vectors.layer
         vectors = x[:, x.shape[1] - layer.axes : -3].reshape(len(x), layer.vectors, 3, -1)
         axes = np.abs(vectors).max(axis=(0, 2, 3)).astype(np.float64)
-        parts = [network.convolved(x[at : at + _BATCH]) for at in range(0, len(x), _BATCH)]
-        first = np.concatenate(parts).transpose(0, 2, 1)
+        inner = np.concatenate([network.convolved(x[at : at + _BATCH]) for at in range(0, len(x), _BATCH)])
+        first = inner.transpose(0, 2, 1)
     low, high = np.quantile(first, [_INPUTS_OUTSIDE, 1 - _INPUTS_OUTSIDE], axis=(0, 2))
     activations: list[list[Floats]] = [[] for _ in network.blocks]
     for at in range(0, len(x), _BATCH):
-        for values, z in zip(activations, network.rectified(x[at : at + _BATCH]), strict=True):
+        part = network.convolved(x[at : at + _BATCH]) if inner is None else inner[at : at + _BATCH]
+        for values, z in zip(activations, network.rectified(part), strict=True):
             values.append(z.reshape(-1, z.shape[2]))
     rows = [np.concatenate(values) for values in activations]
     tops = tuple(_HEADROOM * np.quantile(row, 1 - _OUTSIDE, axis=0) for row in rows)

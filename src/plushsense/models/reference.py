@@ -258,12 +258,11 @@ class Network:
         z: Floats = np.ascontiguousarray(x.transpose(0, 2, 1), dtype=np.float64)
         return z if self.vectors is None else self.vectors(taps_of(z, tap_layer(self.vectors.layer)))
 
-    def rectified(self, x: NDArray[np.floating[Any]]) -> list[Floats]:
-        """Return the ReLU outputs (N, T', F) of each layer, before normalisation, for scaled windows (N, C, T).
+    def rectified(self, z: Floats) -> list[Floats]:
+        """Return the ReLU outputs (N, T', F) of each layer, before normalisation, from the result of `convolved`.
 
         Not for networks with layer normalisation.
         """
-        z = self.convolved(x)
         seen = []
         for block in self.blocks:
             taps = taps_of(padded(z, self.arch, block.layer.reach), block.layer)

@@ -127,6 +127,20 @@ def random_tilt(degrees: float, channels: Channels) -> Transform | None:
     return tilt
 
 
+class Playing:
+    """Play windows at the product of several speeds, so that samples are interpolated once; `Transform`.
+
+    Each of ``speeds`` draws the speed of windows (N, C, T) between each two samples, (N, T - 1) or (N, 1).
+    """
+
+    def __init__(self, *speeds: Transform) -> None:
+        self.speeds = speeds
+
+    def __call__(self, x: Tensor, random: torch.Generator) -> Tensor:
+        drawn = [speed(x, random) for speed in self.speeds]
+        return _played(x, math.prod(drawn[1:], start=drawn[0]).expand(-1, x.shape[2] - 1))
+
+
 def random_tempo(share: float, channels: Channels) -> Transform | None:
     """Play every window faster or slower by a random factor, up to ``share`` more or less.
 
@@ -134,11 +148,10 @@ def random_tempo(share: float, channels: Channels) -> Transform | None:
     """
     del channels
 
-    def play(x: Tensor, random: torch.Generator) -> Tensor:
-        speed = _factors(len(x), share, random)[:, None].expand(-1, x.shape[2] - 1)
-        return _played(x, speed.to(x.device, non_blocking=True))
+    def speed(x: Tensor, random: torch.Generator) -> Tensor:
+        return _factors(len(x), share, random)[:, None].to(x.device, non_blocking=True)
 
-    return play
+    return Playing(speed)
 
 
 def random_warp(spread: float, channels: Channels) -> Transform | None:
@@ -151,14 +164,14 @@ def random_warp(spread: float, channels: Channels) -> Transform | None:
     """
     del channels
 
-    def warp(x: Tensor, random: torch.Generator) -> Tensor:
+    def speed(x: Tensor, random: torch.Generator) -> Tensor:
         import torch
 
         knots = spread * torch.randn(len(x), 1, _WARP_KNOTS, generator=random).to(x.device, non_blocking=True)
         logs = torch.nn.functional.interpolate(knots, size=x.shape[2] - 1, mode="linear", align_corners=True)
-        return _played(x, logs[:, 0].exp())
+        return logs[:, 0].exp()
 
-    return warp
+    return Playing(speed)
 
 
 def _played(x: Tensor, speed: Tensor) -> Tensor:
@@ -227,10 +240,12 @@ def parse_augmentation(text: str) -> tuple[str, float]:
 
 def augmentations(names: Sequence[str], channels: Channels) -> Transform | None:
     """Combine augmentations into one transform, applied in order; None if it would change nothing."""
-    transforms = []
+    transforms = list[Transform]()
     for name, strength in map(parse_augmentation, names):
         transform = AUGMENTATIONS[name].make(strength, channels) if strength > 0.0 else None
-        if transform is not None:
+        if isinstance(transform, Playing) and transforms and isinstance(transforms[-1], Playing):
+            transforms[-1] = Playing(*transforms[-1].speeds, *transform.speeds)
+        elif transform is not None:
             transforms.append(transform)
     if not transforms:
         return None

@@ -22,6 +22,7 @@ from plushsense.models.net import Net
 from plushsense.training.augment import Transform
 from plushsense.training.fast.net import FastNet, can_train
 from plushsense.training.fast.plan import plan_net
+from plushsense.training.fast.stride import Stride, stride_for
 from plushsense.training.fast.vectors import FastVectors
 from plushsense.training.spec import EpochRow, TrainSpec
 
@@ -123,7 +124,7 @@ def step_bytes(arch: Arch, spec: TrainSpec) -> int | None:
     if not is_fast(arch, torch.device(spec.device)):
         return None
     vectors = 0 if arch.vector is None else _VECTOR_VALUES * arch.inputs[0] * arch.span * spec.batch * 4
-    return plan_net(arch.trunk, spec.batch).bytes + vectors
+    return plan_net(stride_for(arch, spec.stride).applied(arch), spec.batch).bytes + vectors
 
 
 # Batches on a GPU up to this size are captured: for larger ones, launching kernels costs little, and memory is kept.
@@ -226,11 +227,19 @@ class Plain:
 
 
 class Fast:
-    """Training with ``training/fast``; methods as in `Plain`."""
+    """Training with ``training/fast``; methods as in `Plain`.
 
-    def __init__(self, net: Net, batch: int, threads: int) -> None:
-        self._net = FastNet(net, batch, threads)
-        self._vectors = None if net.vectors is None else FastVectors(net.vectors, net.arch.span)
+    With a ``stride``, each step begins with another of its samples, and all positions are computed for `logits`.
+    """
+
+    def __init__(self, net: Net, batch: int, threads: int, stride: Stride | None = None) -> None:
+        self._stride = Stride() if stride is None else stride
+        self._whole = None if self._stride.samples == 1 else net
+        self._net = FastNet(net, batch, threads, self._stride)
+        self._vectors, self._reads = None, self._stride.covers(net.arch)
+        if net.vectors is not None:
+            self._reads += net.vectors.layer.reach
+            self._vectors = FastVectors(net.vectors, self._reads, self._stride.inputs)
 
     @property
     def parameters(self) -> Sequence[Tensor]:
@@ -244,20 +253,22 @@ class Fast:
     def step(
         self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        source, vectors = x.time_first, self._vectors
+        source, vectors, stride = x.time_first, self._vectors, self._stride
+        start = int(torch.randint(stride.samples, (1,), generator=random)) if stride.samples > 1 else 0
+        read = slice(start, start + self._reads)
         windows = x.whole[batch] if source is None or augment is not None else None
         if augment is not None and windows is not None:
             windows = augment(windows, random)
         if vectors is not None and windows is not None:
-            vectors.forward(windows)
+            vectors.forward(windows[:, :, read])
 
-        def fill(out: Tensor, start: int, end: int) -> None:
+        def fill(out: Tensor, first: int, end: int) -> None:
             if vectors is not None:
-                vectors.fill(out, start, end)
+                vectors.fill(out, first, end)
             elif windows is not None:
-                out.copy_(windows[start:end].permute(2, 0, 1))
+                out.copy_(windows[first:end, :, read][:, :, :: stride.inputs].permute(2, 0, 1))
             elif source is not None:
-                torch.index_select(source, 1, batch[start:end], out=out)
+                torch.index_select(source[read][:: stride.inputs], 1, batch[first:end], out=out)
 
         loss, logits, gradient = self._net.step(fill, y)
         if vectors is not None and gradient is not None:
@@ -265,6 +276,9 @@ class Fast:
         return loss, logits
 
     def logits(self, x: Windows) -> Tensor:
+        if self._whole is not None:
+            self._whole.import_weights(self.export_weights())
+            return Fast(self._whole, 1, 1).logits(x)
         vectors = self._vectors
 
         def fill(out: Tensor, start: int, end: int) -> None:
@@ -283,14 +297,15 @@ class Fast:
 Engine = Plain | Fast
 
 
-def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int) -> Engine:
+def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int, stride: int = 1) -> Engine:
     """Create the engine for a network, with the weights of ``net``.
 
     Args:
         batch: maximum number of windows in a batch.
         threads: number of threads on the CPU.
+        stride: as in `TrainSpec`.
     """
-    return Fast(net, batch, threads) if is_fast(arch, device) else Plain(net, device)
+    return Fast(net, batch, threads, stride_for(arch, stride)) if is_fast(arch, device) else Plain(net, device)
 
 
 class Adam:

@@ -165,7 +165,7 @@ class _Training:
         net = Net(arch)
         if (weights := store.initial if start is None else start.weights) is not None:
             net.import_weights(weights)
-        self.net = engine(arch, net, channels.device, min(spec.batch, most), spec.threads)
+        self.net = engine(arch, net, channels.device, min(spec.batch, most), spec.threads, spec.stride)
         self._order = torch.Generator().manual_seed(spec.seed)
         self._augment = augmentations(spec.augment, channels)
         self._adam = Adam(self.net.parameters, fused=True, weight_decay=spec.weight_decay, decayed=self.net.decayed)

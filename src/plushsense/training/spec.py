@@ -48,6 +48,8 @@ class TrainSpec:
             lets the network read values in the units of the layout, as in the authors' script (one of `SCALINGS`).
         weight_decay: factor of the L2 regularisation of all parameters but biases, added to the gradient as in MATLAB's
             ``trainnet``, whose default is 0.0001 (0 to 1).
+        stride: samples between the positions of the pool that a step computes, at most: as many as the dilations of the
+            network allow, each step beginning with another; not on a graphics card (from 1; default: by the preset).
         seed: number that all random choices of the training are drawn from (from 0).
         device: what computes; ``auto``: a graphics card with CUDA if there is one (one of `DEVICES`).
         threads: threads of the processor for one training (from 1).
@@ -62,6 +64,7 @@ class TrainSpec:
     augment: tuple[str, ...] = ()
     scaling: str = "z-score"
     weight_decay: float = 0.0
+    stride: int = 1
     seed: int = 0
     device: str = "auto"
     threads: int = 1
@@ -69,6 +72,7 @@ class TrainSpec:
     def __post_init__(self) -> None:
         _at_least("epochs", self.epochs, 1)
         _at_least("batch", self.batch, 2)
+        _at_least("stride", self.stride, 1)
         _at_least("seed", self.seed, 0)
         check_seed(self.seed)
         _at_least("threads", self.threads, 1)
@@ -114,7 +118,7 @@ class TrainSpec:
         return replace(self, **changes)
 
     def to_dict(self) -> dict[str, object]:
-        """Return plain values, ready for JSON, without ``scaling`` and ``weight_decay`` where they are the default.
+        """Return plain values, ready for JSON, without ``scaling``, ``weight_decay`` and ``stride`` at their default.
 
         ``augment`` with at most a random rotation is written as ``turn_deg``, as in earlier versions, so that the ids
         of their trainings and evaluations stay the same.
@@ -122,7 +126,7 @@ class TrainSpec:
         parsed = [parse_augmentation(text) for text in self.augment]
         values: dict[str, Any] = {}
         for key, value in asdict(self).items():
-            if key in ("scaling", "weight_decay") and value == getattr(TrainSpec, key):
+            if key in ("scaling", "weight_decay", "stride") and value == getattr(TrainSpec, key):
                 continue
             if key != "augment":
                 values[key] = value
@@ -169,7 +173,7 @@ EpochProgress = Callable[[int, int, EpochRow], None]
 PRESETS: dict[str, TrainSpec] = {
     "search": TrainSpec(epochs=250, learning_rate=0.001, halve_every=None, patience=None),
     "loso": TrainSpec(),
-    "people": TrainSpec(epochs=60, halve_every=15, patience=None, augment=("random-rotation:45",)),
+    "people": TrainSpec(epochs=60, halve_every=15, patience=None, augment=("random-rotation:45",), stride=4),
     "paper": TrainSpec(),
 }
 

@@ -188,7 +188,7 @@ _SETTINGS: dict[str, tuple[str, ...]] = {
     "model": ("arch", "filters", "padding", "norm", "pool_s"),
     "training": (
         *("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device"),
-        *("augment", "turn_deg", "scaling", "weight_decay"),
+        *("augment", "turn_deg", "scaling", "weight_decay", "stride"),
     ),
     "evaluation": ("split", "classes", "train_context", "workers"),
     "live": ("smoothing_s",),
@@ -205,6 +205,8 @@ def from_stored(config: Mapping[str, Any]) -> RunConfig:
     try:
         tables = {name: dict(config[name]) for name in ("windows", "model", "training", "evaluation", "anywhere")}
         tables["training"]["preset"] = config["preset"]
+        # `TrainSpec.to_dict` leaves it out, and so did earlier versions.
+        tables["training"].setdefault("stride", TrainSpec.stride)
     except (KeyError, TypeError, ValueError):
         raise ConfigError("The settings of this evaluation are incomplete. Evaluate again.") from None
     tables["windows"].pop("span_s", None)

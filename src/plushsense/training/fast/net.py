@@ -21,6 +21,7 @@ from plushsense.models.arch import NORM_EPSILON, Arch, reflected
 from plushsense.models.net import MOMENTUM, Net
 from plushsense.training.fast.conv import LANES, BufferPool, ThreadPool, Way, way
 from plushsense.training.fast.plan import CHUNK, plan_net
+from plushsense.training.fast.stride import Stride
 
 # Function (tensor, start, end) that writes windows [start, end) of a batch into a tensor (rows, windows, channels).
 Fill = Callable[[Tensor, int, int], None]
@@ -65,10 +66,12 @@ class FastNet:
             gradient that it needs.
         batch: largest number of windows in a batch.
         threads: number of threads for the chunks of a batch; it does not affect the result.
+        stride: positions that are computed; of the inputs, only the rows that are read are then filled in.
     """
 
-    def __init__(self, net: Net, batch: int, threads: int = 1) -> None:
-        arch = net.arch.trunk
+    def __init__(self, net: Net, batch: int, threads: int = 1, stride: Stride | None = None) -> None:
+        self._phases = 1 if stride is None else stride.phases
+        arch = net.arch.trunk if stride is None else stride.applied(net.arch)
         self.arch, self.plan = arch, plan_net(arch, batch)
         self._passes_on = net.arch.vector is not None
         self._layers = [self._layer(net, i) for i in range(len(arch.layers))]
@@ -120,7 +123,7 @@ class FastNet:
         self._backward(passes, pooled, slope @ self._dense)
         if not self._passes_on:
             return loss, logits, None
-        return loss, logits, torch.cat([self._gradient(0, i) for i in range(len(self._edges))], dim=1)
+        return loss, logits, torch.cat([self._apart(self._gradient(0, i)) for i in range(len(self._edges))], dim=1)
 
     @torch.no_grad()
     def logits(self, fill: Fill, windows: int) -> Tensor:
@@ -136,7 +139,8 @@ class FastNet:
 
         def read(i: int, lane: int, thread: int) -> Tensor:
             space, size = self._scratch[thread], self._size(i)
-            x = self._input(fill, i, space.take(("read", 0), self.plan.buffers[0], size, self.arch.channels))
+            x = space.take(("read", 0), self.plan.buffers[0], size, self.arch.channels)
+            self._input(fill, i, x, space)
             for at, layer in enumerate(self._layers):
                 out = space.take(("read", 1 + at % 2), self.plan.buffers[at + 1], size, layer.way.plan.filters)
                 spectrum = space.take("spectrum", *layer.way.spectrum_shape(size))
@@ -174,16 +178,34 @@ class FastNet:
     def _folded(self, at: int, a: Tensor | None, b: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return weights, in the form that the method needs, and bias, with the preceding normalisation folded in."""
         layer = self._layers[at]
-        w = layer.w if a is None else layer.w * a[None, :, None]
+        w = self._merged(layer.w) if a is None else layer.w * a[None, :, None]
         bias = layer.bias if b is None else layer.bias + b @ layer.w.sum(0)
         return layer.way.weights(w, self._shared, ("weights", at)), bias
 
-    def _input(self, fill: Fill, i: int, x: Tensor) -> Tensor:
-        front, before = self._layers[0].way.plan.front, self.arch.span
-        fill(x[front : front + before], *self._edges[i])
+    def _merged(self, w: Tensor) -> Tensor:
+        """Return the weights (taps, C, F) of the first layer as a kernel over rows of several phases."""
+        if self._phases == 1:
+            return w
+        taps = self._layers[0].way.plan.taps
+        return F.pad(w, (0, 0, 0, 0, 0, taps * self._phases - len(w))).view(taps, -1, w.shape[2])
+
+    def _apart(self, rows: Tensor) -> Tensor:
+        """Return rows (T', n, phases · C) as (T' · phases, n, C)."""
+        return rows.view(*rows.shape[:2], self._phases, -1).transpose(1, 2).flatten(0, 1)
+
+    def _input(self, fill: Fill, i: int, x: Tensor, space: BufferPool) -> None:
+        """Fill the input buffer ``x`` of the first layer for chunk ``i``."""
+        front, before, phases = self._layers[0].way.plan.front, self.arch.span, self._phases
+        rows = x[front : front + before]
+        if phases == 1:
+            fill(rows, *self._edges[i])
+        else:
+            size, width = self._size(i), self.arch.channels // phases
+            apart = space.take("apart", before * phases, size, width)
+            fill(apart, *self._edges[i])
+            rows.view(before, size, phases, width).copy_(apart.view(before, phases, size, width).transpose(1, 2))
         x[front + before :].zero_()
         self._mirror(0, x)
-        return x
 
     def _mirror(self, at: int, x: Tensor) -> None:
         """Fill the mirrored rows at the start of the input of layer ``at``."""
@@ -231,7 +253,11 @@ class FastNet:
     def _forward(self, fill: Fill) -> tuple[list[_Pass], Tensor]:
         """Return the values that each layer keeps, and the output of the last layer averaged over time (N, F)."""
         chunks, windows = len(self._edges), self._edges[-1][1]
-        self._threads.each(lambda i, lane, thread: self._input(fill, i, self._held(0, i)), chunks)
+
+        def read(i: int, lane: int, thread: int) -> None:
+            self._input(fill, i, self._held(0, i), self._scratch[thread])
+
+        self._threads.each(read, chunks)
         passes: list[_Pass] = []
         pooled: list[Tensor] = []
         for at, layer in enumerate(self._layers):
@@ -283,7 +309,7 @@ class FastNet:
             total = totals[0]
             for lane in range(1, min(LANES, chunks)):
                 total += totals[lane]
-            dw = layer.way.gradient(total).reshape(layer.w.shape)
+            dw = layer.way.gradient(total).reshape(-1, *layer.w.shape[1:])[: len(layer.w)]
             layer.bias.grad = bias
             if at:
                 before = passes[at - 1]

@@ -1,7 +1,8 @@
 """The vector layer with an explicit forward and backward pass, of which nothing but two matrix products is costly.
 
-Values are (L, K, B, N): position in a block, kernel, block, window. A product with a band matrix (L · K, L + taps - 1)
-computes all kernels at L positions; windows come last, so that what follows runs over contiguous memory.
+Values are (L, K, B, N): position in a block, kernel, block, window. A product with a band matrix (L · K, L + taps - 1;
+wider with a stride) computes all kernels at L positions; windows come last, so that what follows runs over contiguous
+memory.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from plushsense.models.net import MOMENTUM, VectorNet
 from plushsense.models.vectors import LENGTH_EPSILON, TURN_EPSILON
 from plushsense.training.fast.plan import CHUNK
 
-# Positions of a block, at most: the band matrix is sparser in longer ones.
+# Samples from the first to the last position of a block, about: the band matrix is sparser in longer ones.
 _BLOCK = 32
 
 
@@ -40,12 +41,13 @@ class FastVectors:
     Args:
         net: the layer, whose weights and running statistics are updated in place.
         samples: T, number of samples of a window.
+        stride: samples between two positions that are computed.
     """
 
-    def __init__(self, net: VectorNet, samples: int) -> None:
+    def __init__(self, net: VectorNet, samples: int, stride: int = 1) -> None:
         layer = net.layer
-        self.net, self.rows = net, samples - layer.reach
-        self._blocks = -(-self.rows // _BLOCK)
+        self.net, self.rows, self._stride = net, (samples - layer.reach - 1) // stride + 1, stride
+        self._blocks = -(-self.rows * stride // _BLOCK)
         self._long = -(-self.rows // self._blocks)
         self._others = len(net.mean) - layer.vectors * layer.invariants
         self._held: list[tuple[list[_Pass], Tensor]] = []
@@ -102,15 +104,16 @@ class FastVectors:
         """Return the values of each vector in windows (n, C, T), and the outputs (T', n, M), not standardized."""
         layer, n = self.net.layer, len(x)
         z = torch.empty(self.rows, n, len(self.net.mean))
-        newest = x[:, :, layer.reach :].permute(2, 0, 1)
+        newest = x[:, :, layer.reach :: self._stride].permute(2, 0, 1)
         z[:, :, : self._others] = newest[:, :, : self._others]
         gravity = newest[:, :, -3:]
         up = gravity * (gravity.square().sum(2, keepdim=True) + LENGTH_EPSILON).rsqrt()
-        up = self._blocked(up.permute(2, 0, 1))[:, None]
+        up = self._blocked(up.permute(2, 0, 1), self._long, self._long)[:, None]
         passes = []
         for number, weight in enumerate(self.net.weight):
             first = self._others + 3 * number
-            taps = self._blocked(x[:, first : first + 3].permute(1, 2, 0), layer.reach)
+            axes = x[:, first : first + 3].permute(1, 2, 0)
+            taps = self._blocked(axes, self._reads, self._long * self._stride)
             held = _turned(taps, self._band(weight), up)
             sense = held.turn * (held.turn.square() + TURN_EPSILON).rsqrt_().sqrt_()
             for place, values in enumerate((held.vertical, held.length, sense)):
@@ -119,14 +122,19 @@ class FastVectors:
             passes.append(held)
         return passes, z
 
-    def _blocked(self, x: Tensor, reach: int = 0) -> Tensor:
-        """Return rows (3, T, n) as blocks (L + reach, 3, B · n), the last one filled up with zeros."""
-        long, blocks, (axes, rows, n) = self._long, self._blocks, x.shape
-        whole = torch.zeros(axes, long * blocks + reach, n)
+    @property
+    def _reads(self) -> int:
+        """Number of samples that the positions of a block depend on."""
+        return (self._long - 1) * self._stride + self.net.layer.kernel
+
+    def _blocked(self, x: Tensor, reads: int, apart: int) -> Tensor:
+        """Return rows (3, T, n) as blocks (``reads``, 3, B · n), one every ``apart`` rows; then zeros follow."""
+        blocks, (axes, rows, n) = self._blocks, x.shape
+        size = max(rows, (blocks - 1) * apart + reads)
+        whole = torch.zeros(axes, size, n)
         whole[:, :rows] = x
-        strides = (n, whole.stride(0), long * n, 1)
-        split = whole.as_strided((long + reach, axes, blocks, n), strides).contiguous()
-        return split.view(long + reach, axes, blocks * n)
+        split = whole.as_strided((reads, axes, blocks, n), (n, size * n, apart * n, 1)).contiguous()
+        return split.view(reads, axes, blocks * n)
 
     def _in_order(self, values: Tensor, n: int) -> Tensor:
         """Return values (L, K, B · n) in the order of time, (T', n, K)."""
@@ -134,15 +142,15 @@ class FastVectors:
         return split.reshape(self._long * self._blocks, n, -1)[: self.rows]
 
     def _band(self, weight: Tensor) -> Tensor:
-        """Return the matrix (L · K, L + reach) with a shifted copy of the weights (K, taps) for each position."""
-        band = torch.zeros(self._long * len(weight), self._long + self.net.layer.reach)
+        """Return the matrix (L · K, reads) with a shifted copy of the weights (K, taps) for each position."""
+        band = torch.zeros(self._long * len(weight), self._reads)
         self._diagonal(band, len(weight)).copy_(weight.expand(self._long, -1, -1))
         return band
 
     def _diagonal(self, band: Tensor, kernels: int) -> Tensor:
         """Return the view (L, K, taps) of what is not always zero in such a matrix."""
         wide = band.shape[1]
-        return band.as_strided((self._long, kernels, self.net.layer.kernel), (kernels * wide + 1, wide, 1))
+        return band.as_strided((self._long, kernels, self.net.layer.kernel), (kernels * wide + self._stride, wide, 1))
 
     def _backward(self, held: _Pass, dz: Tensor) -> Tensor:
         """Return the gradient of the weights (K, taps) of a vector from that of its outputs (T', n, 3 K)."""
