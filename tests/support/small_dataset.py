@@ -113,7 +113,7 @@ def bundle(imported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         # With a patience there is no second training, on everybody, which takes time.
         # Slow and fast differ only in tempo, which the preset would change at random.
         augment = 'augment = ["random-gain:0.3", "random-tilt:8"]\nbatch = 64\n'
-        (draft / "settings.toml").write_text(f"[training]\nepochs = 10\npatience = 10\n{augment}")
+        (draft / "settings.toml").write_text(f"[training]\nepochs = 20\npatience = 20\n{augment}")
         settings = ("--config", str(draft / "settings.toml"), "--filters", "4,4,4", "--force")
         train_apart(made, draft / "model.plush", *settings)
 
