@@ -585,7 +585,7 @@ def test_the_studio_opens_and_saves_the_page_of_an_export(
     page = looking.open(f"{url}/export?name=bear")
     with page.expect_popup() as opened:
         marked(page, "open-page").click()
-    opened.value.wait_for_function("() => document.getElementById('state').textContent === 'Not started'")
+    opened.value.wait_for_function("() => document.getElementById('state')?.textContent === 'Not started'")
     assert axe(opened.value) == []
     opened.value.close()
     with page.expect_download() as saved:
