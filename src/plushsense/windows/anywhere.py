@@ -146,15 +146,15 @@ def cut_anywhere(
     used, left_out = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
     idle = next((g for g in gestures.gestures if g.idle), None)
     adrift = {(r.subject, r.session) for r in dataset.recordings if r.stream_row < 0}
-    # Whoever leaves out all recordings of a stream leaves it out.
-    left = {r.stream for r in dataset.recordings} - {r.stream for r in dataset.used}
+    # Whoever excludes all recordings of a stream excludes it.
+    excluded = {r.stream for r in dataset.recordings} - {r.stream for r in dataset.used}
     moving, resting = list[tuple[RecordingInfo, _Place]](), list[tuple[RecordingInfo, _Place]]()
     free: list[tuple[RecordingInfo, _Place]] = []
     for done, stream in enumerate(dataset.streams):
         in_recordings, unmarked = _positions(dataset, stream, used, reach, anywhere)
         for recording, place in in_recordings:
             (resting if gestures.get(recording.gesture).idle else moving).append((recording, place))
-        if idle is not None and (stream.subject, stream.session) not in adrift and stream.id not in left:
+        if idle is not None and (stream.subject, stream.session) not in adrift and stream.id not in excluded:
             # An idle recording without rows, so that it overlaps no other.
             name, file = f"{stream.id} (unmarked)", stream.file
             key = (name, stream.subject, stream.session, idle.label, file)

@@ -400,8 +400,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         numbers = {name: _python_number(getattr(self, name)) for name in ("epochs", "batch", "learning_rate")}
         layout = layout or anonymous_layout(x)
         symbol = self._symbol(x.shape[2], layout.rate_hz)
-        has_vectors = parse_symbol(symbol).vector is not None
-        spec = preset(self.preset, has_vectors, **numbers, seed=_seed(self.random_state))
+        spec = preset(self.preset, parse_symbol(symbol).vector is not None, **numbers, seed=_seed(self.random_state))
         arch = self._network(symbol, x.shape[1], len(classes), x.shape[2])
         x = to_integers(x, layout)
         order = in_own_order(x, index, *([people] if groups is not None else []))
@@ -422,8 +421,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             weights=None if (trained == 1.0).all() else trained * scaling,
         )
         self.classes_, self.history_ = classes, fitted.history
-        parts = () if groups is None else (~held_back, held_back)
-        people_of = [sorted(set(people[part].tolist())) for part in parts]
+        people_of = [sorted(set(people[p].tolist())) for p in (~held_back, held_back) if groups is not None]
         origin: dict[str, Any] = {
             "dataset": "arrays given to PlushClassifier",
             "estimator": {"settings": self._settings(), **_labels_table(classes)},

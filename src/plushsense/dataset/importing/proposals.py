@@ -518,19 +518,23 @@ def _sphere(points: Floats) -> Sphere | None:
         if np.array_equal(closer, keep):
             break
         keep = closer
-    if radius <= 0:
-        return None
-    # Blocks in one direction are not independent, however many: four directions lie on a sphere whatever their error.
-    kept = points[keep]
-    cells = np.unique(np.round((kept - centre) / (_DIRECTION * radius)), axis=0, return_inverse=True)[1].ravel()
-    n = cells.max() + 1
-    means = np.stack([np.bincount(cells, kept[:, i]) for i in range(3)], axis=1) / np.bincount(cells)[:, None]
-    if n <= _UNKNOWNS:
-        return None
+    return (centre, radius) if radius > 0 and _is_determined(points[keep], (centre, radius)) else None
+
+
+def _is_determined(points: Floats, fit: Sphere) -> bool:
+    """Return whether the directions of points (n, 3) from the centre of a fitted sphere leave little doubt about it.
+
+    Points in one direction count as one, however many: four directions lie on a sphere whatever their error.
+    """
+    centre, radius = fit
+    cells = np.unique(np.round((points - centre) / (_DIRECTION * radius)), axis=0, return_inverse=True)[1].ravel()
+    means = np.stack([np.bincount(cells, points[:, i]) for i in range(3)], axis=1) / np.bincount(cells)[:, None]
+    if len(means) <= _UNKNOWNS:
+        return False
     spread = np.linalg.svd(means - means.mean(axis=0), compute_uv=False)[-1]
     off = np.linalg.norm(means - centre, axis=1) - radius
-    uncertain = max(float(np.sqrt(np.square(off).sum() / (n - _UNKNOWNS))), _MOTION * radius)
-    return (centre, radius) if uncertain <= _STANDARD_ERROR * spread else None
+    error = max(float(np.sqrt(np.square(off).sum() / (len(means) - _UNKNOWNS))), _MOTION * radius)
+    return bool(error <= _STANDARD_ERROR * spread)
 
 
 def _window(dataset: Dataset) -> Iterator[Proposal]:

@@ -627,10 +627,12 @@ def rest_tells(w: DatasetSummary) -> Iterator[Issue]:
     """
     peaks = [float(np.percentile(a, 95)) if len(a := w.activity(o)) else 0.0 for o in w.recordings]
     made: dict[tuple[str, str], set[str]] = {}
-    held: dict[tuple[str, str], set[str]] = {}
+    recorded: dict[tuple[str, str], set[str]] = {}
     for o, peak in zip(w.recordings, peaks, strict=True):
-        for sessions in (held, made)[: 2 if peak >= _SOMETHING else 1]:
-            sessions.setdefault((o.info.subject, o.info.session), set()).add(gesture_of(o))
+        place = o.info.subject, o.info.session
+        recorded.setdefault(place, set()).add(gesture_of(o))
+        if peak >= _SOMETHING:
+            made.setdefault(place, set()).add(gesture_of(o))
     placed = _placed(w)
     rests: list[tuple[RecordingSummary, str, NDArray[np.float64]]] = []
     for o, peak in zip(w.recordings, peaks, strict=True):
@@ -640,7 +642,7 @@ def rest_tells(w: DatasetSummary) -> Iterator[Issue]:
             rests.append((o, gesture_of(o), o.start))
         elif peak < _SOMETHING and len(alone) == 1:
             rests.append((o, next(iter(alone)), o.start))
-        elif len(held[place]) == 1 and (before := _before(w, o, placed)) is not None:
+        elif len(recorded[place]) == 1 and (before := _before(w, o, placed)) is not None:
             rests.append((o, gesture_of(o), before))
     gesture, subject = np.array([label for _, label, _ in rests]), np.array([o.info.subject for o, _, _ in rests])
     if len(rests) < _RESTS or len(set(gesture.tolist())) < 2:
