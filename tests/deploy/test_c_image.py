@@ -24,7 +24,7 @@ TESTS = Path(__file__).parents[1]
 from plushsense.deploy.golden import EVENT, FAULT, HEAD, HEALTH, ToyRows, answers_of, column
 from plushsense.runtime.events import ENDED
 from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
-from plushsense.runtime.image import CALIBRATED_IMAGE_VERSION, IntegerModel, image_head
+from plushsense.runtime.image import CALIBRATED, DEVIATING, IMAGE_VERSION, IntegerModel, image_head
 from support.c_toy import Seat, seat
 from support.integers import any_frames, edged_model, models, plain_model, ruled_model, vector_model
 
@@ -68,9 +68,9 @@ def test_what_plush_begin_says(c_library: Any) -> None:
     assert c_library.plush_memory_bytes(None, 100) == 0
 
 
-def sealed(body: bytes) -> bytes:
+def sealed(body: bytes, version: int = IMAGE_VERSION) -> bytes:
     """With a good checksum, as somebody who writes an image by hand would have it."""
-    return image_head(body) + body
+    return image_head(body, version=version) + body
 
 
 def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
@@ -157,11 +157,13 @@ def test_a_good_checksum_makes_no_vector_layer(c_library: Any) -> None:
         "a sum beyond its bits": (kernel, bytes([int(model.network.vectors.down[0, 0]) - 1])),
     }
     for what, (at, change) in changes.items():
-        wrong = sealed(body[:at] + change + body[at + len(change) :])
+        wrong = sealed(body[:at] + change + body[at + len(change) :], model.image_version)
         assert Seat(c_library, wrong, 4, 3).status == DAMAGED, what
     for cut in range(inputs, layer + 200):
-        assert Seat(c_library, sealed(body[:cut]), 4, 3).status == DAMAGED
-    assert Seat(c_library, sealed(body), 4, 3).status == OK
+        assert Seat(c_library, sealed(body[:cut], model.image_version), 4, 3).status == DAMAGED
+    assert Seat(c_library, sealed(body, model.image_version), 4, 3).status == OK
+    assert model.image_version == IMAGE_VERSION + DEVIATING
+    assert Seat(c_library, sealed(body), 4, 3).status == DAMAGED, "half of the weights of the dense layer are left"
 
 
 def test_a_good_checksum_makes_no_rules(c_library: Any) -> None:
@@ -459,7 +461,7 @@ def test_a_drill_of_bad_updates(sanitized: list[Path], tmp_path: Path) -> None:
     body = models[1].to_bytes()[16:]
     other_layout = sealed(body[:26] + bytes([body[26] ^ 1]) + body[27:])
     foreign = [(other_layout, OTHER_LAYOUT), (edged_model().to_bytes(), OTHER_LAYOUT)]
-    foreign.append((image_head(body, version=CALIBRATED_IMAGE_VERSION) + body, OTHER_VERSION))
+    foreign.append((image_head(body, version=IMAGE_VERSION + CALIBRATED) + body, OTHER_VERSION))
     sound = [*models[1:], vector_model()]
     offered = [*((model.to_bytes(), OK) for model in sound), *2 * foreign]
     (tmp_path / "cases").write_bytes(

@@ -18,7 +18,7 @@ from plushsense.deploy.proof.scenarios import exchanges_of
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.deploy.quantize import integer_model
-from plushsense.runtime.image import CALIBRATED_IMAGE_VERSION, IntegerModel, image_head, memory_bytes
+from plushsense.runtime.image import CALIBRATED, IMAGE_VERSION, IntegerModel, image_head, memory_bytes
 from plushsense.windows.clock import LONG_PAUSE_MS
 from support.c_toy import Seat, seat
 from support.exports import bundle_of, exported
@@ -132,11 +132,12 @@ def test_a_good_checksum_makes_no_calibrated_model(calibrated_library: Any) -> N
         "two axes alike": bytes([1, 1, 2, 2, 128 + 5]),
     }.items():
         wrong = body[:at] + change + body[at + min(len(change), len(plan)) :]
-        image = image_head(wrong, version=CALIBRATED_IMAGE_VERSION) + wrong
+        image = image_head(wrong, version=IMAGE_VERSION + CALIBRATED) + wrong
         assert Seat(calibrated_library, image, 4, 3).status == DAMAGED, what
     for right in (bytes([1, 1, 2, 3, 128 + 5]), bytes([2, 1, 1, 1, 128 + 5, 3, 3, 3, 128 + 8])):
         other = body[:at] + right + body[at + len(plan) :]
-        assert Seat(calibrated_library, image_head(other, version=CALIBRATED_IMAGE_VERSION) + other, 4, 3).status == OK
+        image = image_head(other, version=IMAGE_VERSION + CALIBRATED) + other
+        assert Seat(calibrated_library, image, 4, 3).status == OK
 
 
 def test_readings_at_the_ends_of_the_largest_range(calibrated_library: Any) -> None:

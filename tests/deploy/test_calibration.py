@@ -27,9 +27,13 @@ def windows(seed: int = 0, n: int = 30, samples: int = 60) -> np.ndarray:
     return np.rint(np.cumsum(rng.normal(size=(n, 3, samples)), axis=2) * 300).astype(np.int32)
 
 
-def make(padding: str = "stream", norm: str = "batch") -> Bundle:
-    arch = Arch.parse("5d1_4d3", (6, 5), channels=3, classes=3, padding=padding, norm=norm, window=48, step=4)
-    return Bundle(arch, random_weights(arch, 3), load_layout("accel-3"), Scaler.fit(windows()), GESTURES)
+def make(padding: str = "stream", norm: str = "batch", pooling: str = "mean") -> Bundle:
+    sizes = {"channels": 3, "classes": 3, "window": 48, "step": 4}
+    arch = Arch.parse("5d1_4d3", (6, 5), padding=padding, norm=norm, pooling=pooling, **sizes)
+    weights = random_weights(arch, 3)
+    if pooling != "mean" and norm != "none":
+        weights["norm1.gain"][0] *= -1
+    return Bundle(arch, weights, load_layout("accel-3"), Scaler.fit(windows()), GESTURES)
 
 
 def test_the_same_bundle_gives_the_same_image_also_once_it_was_saved() -> None:
@@ -40,9 +44,18 @@ def test_the_same_bundle_gives_the_same_image_also_once_it_was_saved() -> None:
     assert image != integer_model(calibrated(make(), windows() * 2)).to_bytes(), "the ranges matter"
 
 
-@pytest.mark.parametrize(("padding", "norm"), [("stream", "batch"), ("mirror", "batch"), ("mirror", "none")])
-def test_the_whole_numbers_answer_as_the_floats_do(padding: str, norm: str) -> None:
-    bundle = calibrated(make(padding, norm), windows())
+@pytest.mark.parametrize(
+    ("padding", "norm", "pooling"),
+    [
+        ("stream", "batch", "mean"),
+        ("stream", "batch", "mean+deviation"),
+        ("stream", "none", "mean+deviation"),
+        ("mirror", "batch", "mean"),
+        ("mirror", "none", "mean"),
+    ],
+)
+def test_the_whole_numbers_answer_as_the_floats_do(padding: str, norm: str, pooling: str) -> None:
+    bundle = calibrated(make(padding, norm, pooling), windows())
     x = windows(seed=1, n=200)
     expected = bundle.network().forward(bundle.scaler.apply(x))
     found = integer_network(bundle).forward(x) / 256

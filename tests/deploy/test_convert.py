@@ -166,7 +166,7 @@ def test_small_compilers_and_other_evaluators_can_read_the_graph(symbol: str, na
     model = onnx.load_model_from_string((as_onnx.to_onnx if name == "onnx" else as_onnx.to_integer_onnx)(job).data)
     assert model.opset_import[0].version == 13 and model.ir_version == 7
     kinds = [node.op_type for node in model.graph.node]
-    assert kinds[kinds.index("GlobalAveragePool") + 1] == "Flatten"
+    assert kinds[kinds.index("Flatten") - 1] in ("GlobalAveragePool", "Concat")
     assert not {"ReduceMean", "ReduceSumSquare", "BatchNormalization"} & set(kinds)
     # Of 8-bit codes (N, F, T), OpenVINO 2026.4 has the mean of the first F windows only.
     before = {node.output[0]: node.op_type for node in model.graph.node}
@@ -235,7 +235,7 @@ def test_onnxruntime_infers_the_shapes_of_vector_networks(onnx_here: None) -> No
     model = onnx.load_model_from_string(as_onnx.float_model(bundle))
     inferred = SymbolicShapeInference.infer_shapes(model, auto_merge=True)
     shapes = {each.name: each.type.tensor_type.shape.dim for each in inferred.graph.value_info}
-    assert [d.dim_param or d.dim_value for d in shapes["pooled"]] == ["N", 6]
+    assert [d.dim_param or d.dim_value for d in shapes["pooled"]] == ["N", 2 * 6]
 
 
 @pytest.mark.parametrize("layout", ["plush-15", "phone-6"])

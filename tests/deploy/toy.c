@@ -376,8 +376,8 @@ static uint32_t spoil(uint8_t *out, const uint8_t *whole, uint32_t bytes, uint32
         at = draw(bytes);
         memset(out + at, 0xff, bytes - at);
         return draw(2) == 0 && memcmp(out, whole, bytes) != 0 ? bytes : at;
-    case 3: /* older and newer ones */
-        out[4] = (uint8_t)(PLUSH_IMAGE_VERSION + (draw(2) == 0 ? 1 + draw(99) : 256 - 1 - draw(PLUSH_IMAGE_VERSION)));
+    case 3: /* older and newer ones; two more is the version with deviations */
+        out[4] = (uint8_t)(PLUSH_IMAGE_VERSION + (draw(2) == 0 ? 3 + draw(97) : 256 - 1 - draw(PLUSH_IMAGE_VERSION)));
         return bytes;
     case 4: /* a piece that comes twice, or not, and all after it in the wrong place */
         at = HEAD_BYTES + draw(bytes - HEAD_BYTES - 8);

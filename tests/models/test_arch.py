@@ -149,6 +149,8 @@ def test_filters_as_text(text: str, place: int) -> None:
         ({"pool": 0}, "pool is 0"),
         ({"pool": 125, "padding": "mirror"}, "leave pool out"),
         ({"channels": 2.0}, "channels is 2.0"),
+        ({"pooling": "max"}, "accepted are mean, mean+deviation"),
+        ({"pooling": "mean+deviation", "padding": "mirror"}, "needs the padding 'stream', not 'mirror'"),
     ],
 )
 def test_settings_that_do_not_fit(setting: dict[str, object], why: str) -> None:
@@ -188,6 +190,18 @@ def test_parameters_are_the_learnable_tensors() -> None:
         "norm1.mean",
         "norm1.var",
     }
+
+
+def test_networks_with_a_vector_layer_pool_deviations_too_and_earlier_ones_do_not() -> None:
+    arch = Arch.parse("v14_17d2_19d4", (6, 16, 16), channels=6)
+    assert (arch.pooling, arch.features, arch.weight_shapes["dense.weight"]) == ("mean+deviation", 32, (18, 32))
+    plain = Arch.parse("v14_17d2_19d4", (6, 16, 16), channels=6, pooling="mean")
+    assert arch.parameters == plain.parameters + 16 * 18
+    table = arch.to_dict()
+    assert Arch.from_dict(table) == arch and table.pop("pooling") == "mean+deviation"
+    # As bundles from before have it.
+    assert Arch.from_dict(table) == plain and plain.to_dict() == table
+    assert Arch.parse("14", (8,)).pooling == "mean"
 
 
 @pytest.mark.parametrize("table", [{"filters": [8]}, {"symbol": "14"}, {"symbol": 14, "filters": [8]}])

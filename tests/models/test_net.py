@@ -44,6 +44,20 @@ def test_the_same_numbers_as_the_reference(symbol: str, padding: str, norm: str)
 
 
 @pytest.mark.parametrize("norm", NORMS)
+def test_deviations_are_those_of_the_reference(norm: str) -> None:
+    arch = Arch.parse("14d1_19d2", (6, 8), norm=norm, pooling="mean+deviation")
+    weights = random_weights(arch, 5)
+    if norm != "none":
+        weights["norm1.gain"][::2] *= -1
+    net = Net(arch).double().eval()
+    net.import_weights(weights)
+    x = np.random.default_rng(1).normal(size=(3, arch.channels, arch.span))
+    with torch.no_grad():
+        found = net(torch.from_numpy(x)).numpy()
+    assert np.abs(found - Network(arch, weights).forward(x)).max() < 1e-9
+
+
+@pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("padding", PADDINGS)
 def test_in_double_precision_nothing_is_left(padding: str, norm: str) -> None:
     # The layer norm of few filters may enlarge float32 rounding beyond 1e-5: in float64 only an error would show.

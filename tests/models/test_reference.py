@@ -21,8 +21,8 @@ pytestmark = pytest.mark.slow
 SMALL = {"channels": 3, "classes": 4, "window": 40}
 
 
-def small(padding: str = "stream", norm: str = "batch", seed: int = 1) -> Network:
-    arch = Arch.parse("4d1_3d2_2d5", (5, 4, 6), padding=padding, norm=norm, **SMALL)
+def small(padding: str = "stream", norm: str = "batch", seed: int = 1, pooling: str = "mean") -> Network:
+    arch = Arch.parse("4d1_3d2_2d5", (5, 4, 6), padding=padding, norm=norm, pooling=pooling, **SMALL)
     return Network(arch, random_weights(arch, seed))
 
 
@@ -53,13 +53,17 @@ def oracle(arch: Arch, weights: dict[str, NDArray[np.float32]], window: NDArray[
             mean, var = out.mean(axis=0), out.var(axis=0)
         z = (out - mean) / np.sqrt(var + 1e-5)
         z = z * weights[f"norm{i}.gain"][:, None] + weights[f"norm{i}.shift"][:, None]
-    return list(weights["dense.weight"] @ z.mean(axis=1) + weights["dense.bias"])
+    pooled = z.mean(axis=1)
+    if arch.pooling != "mean":
+        steps = [[part.mean() for part in np.split(row, arch.blocks)] for row in z]
+        pooled = np.append(pooled, [np.mean([abs(m - np.mean(row)) for m in row]) for row in steps])
+    return list(weights["dense.weight"] @ pooled + weights["dense.bias"])
 
 
 @pytest.mark.parametrize("norm", NORMS)
-@pytest.mark.parametrize("padding", PADDINGS)
-def test_forward_is_the_definition(padding: str, norm: str) -> None:
-    network = small(padding, norm)
+@pytest.mark.parametrize(("padding", "pooling"), [*((p, "mean") for p in PADDINGS), ("stream", "mean+deviation")])
+def test_forward_is_the_definition(padding: str, pooling: str, norm: str) -> None:
+    network = small(padding, norm, pooling=pooling)
     weights = random_weights(network.arch, 1)
     x = windows(network, 2)
     expected = np.array([oracle(network.arch, weights, w) for w in x])

@@ -132,7 +132,7 @@ def test_counts() -> None:
     arch = Arch.parse("v14_17d2_19d4", "6,16,16", channels=6, classes=10)
     assert (arch.symbol, arch.filters, arch.inputs) == ("v14_17d2_19d4", (6, 16, 16), (18, 16))
     convolutions = 17 * 18 * 16 + 19 * 16 * 16
-    assert arch.parameters == 6 * 14 + convolutions + 4 * 32 - 2 * 16 - 2 * 16 + 32 + 16 * 10 + 10
+    assert arch.parameters == 6 * 14 + convolutions + 4 * 32 - 2 * 16 - 2 * 16 + 32 + 2 * 16 * 10 + 10
     assert arch.macs_per_sample == 3 * 6 * 14 + convolutions
     assert arch.receptive_field == 1 + 13 + 16 * 2 + 18 * 4
     assert arch.span == arch.receptive_field + arch.pooled - 1

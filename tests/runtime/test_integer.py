@@ -152,6 +152,13 @@ def test_against_loops_of_plain_integers(model: IntegerModel, seed: int) -> None
         z = rows
     assert len(z) == arch.pooled
     pooled = [sum(column) for column in zip(*z, strict=True)]
+    if arch.pooling != "mean":
+        steps = [
+            [sum(part) for part in zip(*z[at : at + arch.step], strict=True)] for at in range(0, len(z), arch.step)
+        ]
+        for total, column in zip(tuple(pooled), zip(*steps, strict=True), strict=True):
+            assert 0 <= max(column) < 1 << 16
+            pooled.append(2 * sum(max(0, one - total // len(column)) for one in column))
     dense = network.dense
     sums = [
         b + sum(p * int(w) for p, w in zip(pooled, ws, strict=True))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.gestures import AFFECTS, Gesture, GestureSet
 from plushsense.core.layouts import MOST_CALIBRATED_OTHER, Channel, CsvFormat, Derived, Layout, magnitude_limit
-from plushsense.models.arch import Arch, ConvLayer, VectorLayer
+from plushsense.models.arch import POOLINGS, Arch, ConvLayer, VectorLayer
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import NO_GESTURE, EventSettings
 from plushsense.runtime.fixed import InputScale, LogitScale, Requantize, split_ratio
@@ -223,7 +223,8 @@ def models(draw: st.DrawFn, longest: int = 700, window: bool = False, calibrated
         layers.append(ConvLayer(kernel, dilation, draw(st.integers(1, 20))))
         left -= layers[-1].reach
     step = draw(st.integers(1, 10))
-    settings: dict[str, Any] = {"pool": step * draw(st.integers(1, 10)), "vector": vector}
+    pooling = draw(st.sampled_from(POOLINGS))
+    settings: dict[str, Any] = {"pool": step * draw(st.integers(1, 10)), "vector": vector, "pooling": pooling}
     if window:
         # Most reach back further than the shorter windows, so that samples are reflected again.
         samples = draw(st.integers(2, 40) | st.integers(2, longest))
@@ -301,7 +302,8 @@ def vector_model(seed: int = 1) -> IntegerModel:
     plain = plain_model(seed)
     axes = tuple(replace(c, kind="acceleration") for c in plain.layout.channels[1:])
     layout = replace(plain.layout, channels=(plain.layout.channels[0], *axes), vectors=(("x", "y", "z"),)).for_vectors()
-    arch = replace(plain.network.arch, channels=layout.n_inputs, vector=VectorLayer(3, 2, 1))
+    made = {"vector": VectorLayer(3, 2, 1), "pooling": "mean+deviation"}
+    arch = replace(plain.network.arch, channels=layout.n_inputs, **made)
     network = any_network(arch, layout, np.random.default_rng(seed))
     weights = np.full((1, 2, 3), 127, dtype=np.int8)
     vectors = IntegerVectors(VectorLayer(3, 2, 1), np.array([0]), weights, down_for(weights))

@@ -107,7 +107,7 @@ def run_arch(args: argparse.Namespace) -> int:
     arch = Arch.parse(
         args.spec,
         args.filters,
-        **options(args, "channels", "classes", "padding", "norm", "window", "step", "pool", "vectors"),
+        **options(args, "channels", "classes", "padding", "norm", "window", "step", "pool", "vectors", "pooling"),
     )
     printed = f" (the paper's Table 3 prints {arch.table3})" if arch.table3 else ""
     seconds = arch.receptive_field / args.rate
@@ -116,7 +116,8 @@ def run_arch(args: argparse.Namespace) -> int:
         args,
         card(arch, rate_hz=args.rate),
         [
-            f"{arch.symbol}  filters {','.join(map(str, arch.filters))}  padding {arch.padding}  norm {arch.norm}",
+            f"{arch.symbol}  filters {','.join(map(str, arch.filters))}  padding {arch.padding}  norm {arch.norm}"
+            f"  pooling {arch.pooling}",
             f"  parameters        {arch.parameters:,}{printed}",
             f"  receptive field   {arch.receptive_field} samples, {seconds:.2f} s at {args.rate:g} Hz",
             f"  span              {arch.span} samples seen by a decision, {arch.span / args.rate:.2f} s",

@@ -56,7 +56,7 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
     return resolve(
         args.config,
         windows=options(args, "context", "window_s"),
-        model=options(args, "arch", "filters", "padding", "norm", "pool_s"),
+        model=options(args, "arch", "filters", "padding", "norm", "pool_s", "pooling"),
         training=options(args, "preset", "epochs", "batch", "seed", "device", "scaling", "weight_decay"),
         evaluation={"classes": args.classes, "seed": args.seed, **evaluation},
     )

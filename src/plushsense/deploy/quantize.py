@@ -13,7 +13,7 @@ falls from 2.0–4.3 % of their spread (bias alone, no headroom of the ranges) t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ArchError, BundleError
 from plushsense.models.arch import NORM_EPSILON, Arch, VectorLayer
 from plushsense.models.bundle import Bundle
-from plushsense.models.reference import Network, affine
+from plushsense.models.reference import Network, affine, step_sums
 from plushsense.runtime.classifier import BothEngines, IntegerClassifier, StreamClassifier, StreamReader
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.fixed import (
@@ -71,6 +71,7 @@ class Ranges:
 
     Activations are before normalisation; ``means`` holds the means of the inputs (C,), then of each layer (F,). With a
     vector layer, the inputs are its outputs; ``axes`` (V,) holds the largest scaled value of an axis of each vector.
+    ``deviation`` (F,), with the pooling ``mean+deviation``, holds the mean of that statistic of the last layer.
     """
 
     low: Floats
@@ -78,12 +79,13 @@ class Ranges:
     tops: tuple[Floats, ...]
     means: tuple[Floats, ...]
     axes: Floats
+    deviation: Floats = field(default_factory=lambda: np.empty(0))
 
     def to_dict(self) -> dict[str, object]:
         """Return the ranges as plain values for JSON."""
         lists = {name: [part.tolist() for part in getattr(self, name)] for name in ("tops", "means")}
-        axes = {"axes": self.axes.tolist()} if len(self.axes) else {}
-        return {"low": self.low.tolist(), "high": self.high.tolist(), **lists, **axes}
+        others = {name: getattr(self, name).tolist() for name in ("axes", "deviation") if len(getattr(self, name))}
+        return {"low": self.low.tolist(), "high": self.high.tolist(), **lists, **others}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Ranges:
@@ -95,7 +97,8 @@ class Ranges:
         try:
             low, high = (np.asarray(table[name], dtype=np.float64) for name in ("low", "high"))
             tops, means = (tuple(np.asarray(t, dtype=np.float64) for t in table[name]) for name in ("tops", "means"))
-            return cls(low, high, tops, means, np.asarray(table.get("axes", ()), dtype=np.float64))
+            axes, deviation = (np.asarray(table.get(name, ()), dtype=np.float64) for name in ("axes", "deviation"))
+            return cls(low, high, tops, means, axes, deviation)
         except KeyError as missing:
             raise BundleError(
                 f"The calibration in the bundle lacks {missing} (it was made by an earlier PlushSense): train it "
@@ -108,7 +111,8 @@ class Ranges:
         """Raise BundleError if the ranges do not fit the network ``arch``."""
         inputs, filters = arch.inputs[0], arch.trunk.filters
         needed = [inputs, inputs, *filters, inputs, *filters, 0 if arch.vector is None else arch.vector.vectors]
-        parts = [self.low, self.high, *self.tops, *self.means, self.axes]
+        needed.append(arch.features - filters[-1])
+        parts = [self.low, self.high, *self.tops, *self.means, self.axes, self.deviation]
         if [p.shape for p in parts] != [(n,) for n in needed] or not all(np.isfinite(p).all() for p in parts):
             raise BundleError(f"The calibration is not that of {arch.title}, or holds no numbers: train again.")
 
@@ -124,14 +128,18 @@ def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
         first = inner.transpose(0, 2, 1)
     low, high = np.quantile(first, [_INPUTS_OUTSIDE, 1 - _INPUTS_OUTSIDE], axis=(0, 2))
     activations: list[list[Floats]] = [[] for _ in network.blocks]
+    deviations: list[Floats] = []
     for at in range(0, len(x), _BATCH):
         part = network.convolved(x[at : at + _BATCH]) if inner is None else inner[at : at + _BATCH]
         for values, z in zip(activations, network.rectified(part), strict=True):
             values.append(z.reshape(-1, z.shape[2]))
+        if network.arch.pooling != "mean":
+            deviations.append(network.pooled(step_sums(z, network.arch))[:, z.shape[2] :])
     rows = [np.concatenate(values) for values in activations]
     tops = tuple(_HEADROOM * np.quantile(row, 1 - _OUTSIDE, axis=0) for row in rows)
     inputs = np.asarray(first.mean(axis=(0, 2), dtype=np.float64))
-    return Ranges(low, high, tops, (inputs, *(row.mean(axis=0) for row in rows)), axes)
+    deviation = np.concatenate(deviations).mean(axis=0) if deviations else np.empty(0)
+    return Ranges(low, high, tops, (inputs, *(row.mean(axis=0) for row in rows)), axes, deviation)
 
 
 def refuse_undeployable(arch: Arch) -> None:
@@ -165,6 +173,8 @@ def folded(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> list[tuple[Floats
         parts.append((w * gain[:, None], weights[f"conv{i}.bias"] + w.sum(axis=2) @ shift))
         gain, shift = affine(arch, i, weights)
     w = weights["dense.weight"].astype(np.float64)
+    if arch.pooling != "mean":
+        gain, shift = np.concatenate([gain, np.abs(gain)]), np.concatenate([shift, np.zeros(len(shift))])
     return [*parts, (w * gain, weights["dense.bias"] + w @ shift)]
 
 
@@ -188,6 +198,9 @@ def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ra
         gain, start = affine(arch, i, weights)
         unit = gain * top / 255
         mean = gain * ranges.means[i + 1] + start
+    if arch.pooling != "mean":
+        unit, start = np.concatenate([unit, np.abs(unit)]), np.concatenate([start, np.zeros(len(start))])
+        mean = np.concatenate([mean, np.abs(gain) * ranges.deviation])
     w, b = weights["dense.weight"].astype(np.float64), weights["dense.bias"].astype(np.float64)
     whole, bias, size = _eight_bits(w * unit / arch.pooled, b + w @ start, _codes(mean, start, unit) * arch.pooled)
     dense = IntegerDense(whole, bias, LogitScale(*_split(size * 256, 1 << 14)))

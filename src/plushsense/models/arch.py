@@ -1,7 +1,7 @@
 """Parse the symbol of a network (``14d1_39d2_41d4``), and count its parameters, operations and memory.
 
 Layers are joined by ``_``; each is a kernel length, and ``d`` with a dilation (paper, section 3.6.2). A layer is
-Conv1d → ReLU → normalisation; the mean over time and one dense layer follow the last one.
+Conv1d → ReLU → normalisation; statistics over time and one dense layer follow the last one.
 
 A first token ``v`` with a kernel length, as in ``v14_19d2_19d4``, is a vector layer (see `VectorLayer`).
 """
@@ -130,8 +130,10 @@ def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
 
 Padding = Literal["stream", "causal", "mirror"]
 Norm = Literal["batch", "layer", "none"]
+Pooling = Literal["mean", "mean+deviation"]
 PADDINGS: tuple[str, ...] = get_args(Padding)
 NORMS: tuple[str, ...] = get_args(Norm)
+POOLINGS: tuple[str, ...] = get_args(Pooling)
 
 NORM_TENSORS: dict[Norm, tuple[str, ...]] = {
     "batch": ("gain", "shift", "mean", "var"),
@@ -243,6 +245,7 @@ class ArchSettings(TypedDict, total=False):
     window: int
     step: int
     pool: int | None
+    pooling: str | None
 
 
 @dataclass(frozen=True)
@@ -252,6 +255,9 @@ class Arch:
     ``window`` and ``step`` are in samples. ``pool`` is the number of positions that the mean is taken over, only for
     the padding ``stream``. By default it is the largest multiple of ``step`` with which the span fits into the window,
     or, if the receptive field is too long for that, the window rounded down to a multiple of ``step``.
+
+    ``pooling`` names the statistics over the pool that the dense layer reads: ``mean``, or ``mean+deviation``, the mean
+    of each filter and then the mean absolute deviation of its means of each step, only for the padding ``stream``.
     """
 
     layers: tuple[ConvLayer, ...]
@@ -263,6 +269,7 @@ class Arch:
     step: int = 5
     pool: int | None = None
     vector: VectorLayer | None = None
+    pooling: Pooling = "mean"
 
     def __post_init__(self) -> None:
         if not self.layers or len(self.layers) > MAX_LAYERS:
@@ -273,6 +280,7 @@ class Arch:
             _in_range(f"the filter count of layer {n}", layer.filters, 1, MAX_NUMBER)
         check_known(self.padding, PADDINGS, "padding", ArchError)
         check_known(self.norm, NORMS, "norm", ArchError)
+        check_known(self.pooling, POOLINGS, "pooling", ArchError)
         _in_range("channels", self.channels, 1, MAX_NUMBER)
         if self.vector is not None:
             self._check_vector(self.vector)
@@ -280,6 +288,11 @@ class Arch:
         _in_range("window", self.window, 2, 1_000_000)
         _in_range("step", self.step, 1, self.window, " (the window)")
         if self.padding != "stream":
+            if self.pooling != "mean":
+                raise ArchError(
+                    f"The pooling '{self.pooling}' needs the padding 'stream', not '{self.padding}': change the "
+                    "padding, or use the pooling 'mean'."
+                )
             if self.pool is not None:
                 raise ArchError(
                     f"pool belongs to the padding 'stream'; under '{self.padding}' the mean runs over the "
@@ -315,7 +328,8 @@ class Arch:
     ) -> Arch:
         """Build a network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra ones are ignored).
 
-        ``vectors`` is their number, besides gravity, for a symbol with a vector layer; ``settings`` are the others.
+        ``vectors`` is their number, besides gravity, for a symbol with a vector layer; ``settings`` are the others. The
+        pooling is by default that of `default_pooling`.
 
         Raises:
             ArchError: for an invalid symbol (with a caret under the character) or setting.
@@ -339,6 +353,7 @@ class Arch:
         if shape.vector is not None:
             vector, counts = VectorLayer(shape.vector, counts[0], vectors), counts[1:]
         layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape.layers, counts, strict=False))
+        settings["pooling"] = settings.get("pooling") or default_pooling(vector is not None)
         return cls(layers, vector=vector, **cast(Any, settings))
 
     @property
@@ -372,7 +387,7 @@ class Arch:
     @property
     def features(self) -> int:
         """Number of inputs of the dense layer."""
-        return self.layers[-1].filters
+        return self.layers[-1].filters * (2 if self.pooling == "mean+deviation" else 1)
 
     @property
     def trunk(self) -> Arch:
@@ -411,6 +426,11 @@ class Arch:
     def pooled(self) -> int:
         """Number of positions of the last layer that the mean is taken over."""
         return self.window if self.pool is None else self.pool
+
+    @property
+    def blocks(self) -> int:
+        """Number of whole steps in the pool."""
+        return self.pooled // self.step
 
     @property
     def span(self) -> int:
@@ -455,7 +475,7 @@ class Arch:
         """Bytes of state that the network keeps between samples with 8-bit activations.
 
         ``stream``: a ring buffer of reach + 1 samples before each layer, and pool / step block sums of 16 bits for
-        each feature; before a vector layer, a ring buffer of its axes with 16 bits. Otherwise a ring buffer of the
+        each filter; before a vector layer, a ring buffer of its axes with 16 bits. Otherwise a ring buffer of the
         window, from which all activations are computed again.
         `plushsense.runtime.image.memory_bytes` gives all memory of a toy: also padding of the buffers to a multiple of
         4, the clock, sums and probabilities.
@@ -464,7 +484,7 @@ class Arch:
             return self.window * self.channels
         rings = sum((layer.reach + 1) * read for layer, read in zip(self.layers, self.inputs, strict=True))
         axes = 0 if self.vector is None else 2 * 3 * self.vector.vectors * self.vector.kernel
-        return axes + rings + 2 * self.features * (self.pool // self.step)
+        return axes + rings + 2 * self.layers[-1].filters * self.blocks
 
     @property
     def table3(self) -> str | None:
@@ -478,14 +498,18 @@ class Arch:
 
     def to_dict(self) -> dict[str, object]:
         """Return plain values, ready for JSON; the layers as their symbol."""
-        others = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("layers", "vector")}
+        apart = ("layers", "vector", "pooling")
+        others = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in apart}
         vectors = {} if self.vector is None else {"vectors": self.vector.vectors}
-        return {"symbol": self.symbol, "filters": list(self.filters), **others, **vectors}
+        # Left out for the mean, as in bundles from before there was another.
+        pooling = {} if self.pooling == "mean" else {"pooling": self.pooling}
+        return {"symbol": self.symbol, "filters": list(self.filters), **others, **vectors, **pooling}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Arch:
         """Build the network that ``to_dict`` described; raise ArchError for a missing, unknown or invalid key."""
-        known = ("symbol", "filters", "channels", "classes", "padding", "norm", "window", "step", "pool", "vectors")
+        settings = ("channels", "classes", "padding", "norm", "window", "step", "pool", "vectors", "pooling")
+        known = ("symbol", "filters", *settings)
         refuse_unknown(table, known, "an architecture", ArchError)
         missing = [key for key in known[:2] if key not in table]
         if missing:
@@ -493,7 +517,16 @@ class Arch:
         spec, filters = table["symbol"], table["filters"]
         if not isinstance(spec, str) or not isinstance(filters, str | Sequence):
             raise ArchError("An architecture needs its symbol as text and its filters as a list of whole numbers.")
-        return cls.parse(spec, filters, **{k: v for k, v in table.items() if k not in known[:2]})
+        return cls.parse(spec, filters, **{"pooling": "mean"} | {k: v for k, v in table.items() if k in settings})
+
+
+def default_pooling(has_vectors: bool) -> Pooling:
+    """Return the pooling of a network for which none is given.
+
+    With a vector layer, the deviation reads people left out better (docs/measurements/people.md). Without one it was
+    not measured on real recordings, and networks have the mean alone, as in the paper.
+    """
+    return "mean+deviation" if has_vectors else "mean"
 
 
 def reflected(length: int, left: int) -> NDArray[np.intp]:

@@ -122,6 +122,12 @@ class VectorNet(nn.Module):
         _copy(self.tensors(), weights)
 
 
+def deviation(z: Tensor, step: int) -> Tensor:
+    """Return the mean absolute deviation (N, F) of the means of each step of the pool (N, F, T)."""
+    means = z.reshape(*z.shape[:2], -1, step).mean(dim=3)
+    return (means - means.mean(dim=2, keepdim=True)).abs().mean(dim=2)
+
+
 class Net(nn.Module):
     """A trainable network that computes logits (N, K) from scaled windows (N, C, T).
 
@@ -144,7 +150,10 @@ class Net(nn.Module):
         z = z.unsqueeze(2).contiguous(memory_format=FORMAT)
         for block in self.blocks:
             z = block(z)
-        return cast(Tensor, self.dense(z.mean(dim=(2, 3))))
+        mean = z.mean(dim=(2, 3))
+        if self.arch.pooling == "mean":
+            return cast(Tensor, self.dense(mean))
+        return cast(Tensor, self.dense(torch.cat([mean, deviation(z[:, :, 0], self.arch.step)], dim=1)))
 
     def _tensors(self) -> dict[str, Tensor]:
         """Return the tensors by their names in a weights dict; here a ``conv{i}.weight`` is (F, C, 1, K)."""

@@ -7,7 +7,7 @@ All values are computed in float64 from float32 weights; internal arrays have ti
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -54,24 +54,26 @@ class SampleRing:
 
 
 class Pool:
-    """The mean of the last ``blocks`` · ``step`` rows, updated every ``step`` rows.
+    """Statistics of the last ``blocks`` · ``step`` rows, updated every ``step`` rows.
 
-    It keeps one sum per step. Sums are never subtracted, so that rounding errors do not accumulate.
+    It keeps one sum per step. Sums are never subtracted, so that rounding errors do not accumulate. ``statistics`` maps
+    sums (m, blocks, F) to the inputs (m, features) of the dense layer.
     """
 
-    def __init__(self, step: int, blocks: int, features: int) -> None:
+    def __init__(self, step: int, blocks: int, filters: int, statistics: Callable[[Floats], Floats]) -> None:
         self.step = step
         self.blocks = blocks
-        self.done = np.empty((0, features))  # sums of whole steps, at most blocks − 1
-        self.open = np.zeros(features)  # sum of the current, incomplete step
+        self.statistics = statistics
+        self.done = np.empty((0, filters))  # sums of whole steps, at most blocks − 1
+        self.open = np.zeros(filters)  # sum of the current, incomplete step
         self.held = 0
 
     def feed(self, z: Floats) -> Floats:
-        """Add rows (n, F); return the mean (m, F) at each step that they complete, once there are enough steps."""
+        """Add rows (n, F); return statistics (m, features) at each step that they complete, once there are enough."""
         if self.held + len(z) < self.step:
             self.open = self.open + z.sum(axis=0)
             self.held += len(z)
-            return z[:0]
+            return self.statistics(np.empty((0, self.blocks, z.shape[1])))
         head = self.step - self.held
         whole = (len(z) - head) // self.step
         rest = z[head + whole * self.step :]
@@ -81,11 +83,9 @@ class Pool:
         self.open, self.held = rest.sum(axis=0), len(rest)
         self.done = sums[max(len(sums) - self.blocks + 1, 0) :]
         n = len(sums) - self.blocks + 1
-        if n <= 0:
-            return z[:0]
         row, item = sums.strides
-        runs = np.ndarray((n, self.blocks, sums.shape[1]), np.float64, sums, 0, (row, row, item))
-        return np.asarray(runs.sum(axis=1) / (self.blocks * self.step))
+        shape = (max(n, 0), self.blocks, sums.shape[1])
+        return self.statistics(np.ndarray(shape, np.float64, sums, 0, (row, row, item)))
 
 
 class WindowRing:
@@ -242,7 +242,7 @@ class Network:
         return self.classify(self.features(x))
 
     def features(self, x: NDArray[np.floating[Any]]) -> Floats:
-        """Return the inputs of the dense layer, means over time (N, F), for scaled windows (N, C, T).
+        """Return the inputs of the dense layer, statistics over time (N, features), for scaled windows (N, C, T).
 
         Raises:
             BadInput: as in `forward`.
@@ -251,7 +251,14 @@ class Network:
         z = self.convolved(x[:, :, x.shape[2] - self.arch.span :])
         for block in self.blocks:
             z = _through(z, block, self.arch)
-        return np.asarray(z.mean(axis=1))
+        return np.asarray(z.mean(axis=1)) if self.arch.pooling == "mean" else self.pooled(step_sums(z, self.arch))
+
+    def pooled(self, sums: Floats) -> Floats:
+        """Return the inputs (N, features) of the dense layer from the sums (N, blocks, F) of each step."""
+        mean = np.asarray(sums.sum(axis=1) / self.arch.pooled)
+        if self.arch.pooling == "mean":
+            return mean
+        return np.concatenate([mean, np.abs(sums / self.arch.step - mean[:, None]).mean(axis=1)], axis=1)
 
     def convolved(self, x: NDArray[np.floating[Any]]) -> Floats:
         """Return the inputs of the first convolution (N, T', C') for scaled windows (N, C, T)."""
@@ -271,7 +278,7 @@ class Network:
         return seen
 
     def classify(self, pooled: Floats) -> Floats:
-        """Apply the dense layer: means over time (N, F) → logits (N, K)."""
+        """Apply the dense layer: statistics over time (N, features) → logits (N, K)."""
         return np.asarray(pooled @ self._dense + self._bias)
 
     def probabilities(self, x: NDArray[np.floating[Any]]) -> Floats:
@@ -281,6 +288,11 @@ class Network:
     def stepper(self) -> Stepper:
         """Return a new `Stepper` for one stream."""
         return _Streaming(self) if self.arch.padding == "stream" else _Recomputing(self)
+
+
+def step_sums(z: Floats, arch: Arch) -> Floats:
+    """Return the sums (N, blocks, F) of each step of the pool (N, T', F)."""
+    return np.asarray(z.reshape(len(z), arch.blocks, arch.step, z.shape[2]).sum(axis=2))
 
 
 def check_windows(arch: Arch, shape: tuple[int, ...]) -> None:
@@ -365,7 +377,7 @@ class _Streaming(_FloatStepper):
     """Stepper for the padding ``stream``, in which every layer output is computed once."""
 
     def _clear(self) -> None:
-        self._rings, self._pool = stream_state(self.arch.trunk)
+        self._rings, self._pool = stream_state(self.arch.trunk, self.network.pooled)
         self._axes = axes_ring(self.arch)
 
     def _advance(self, chunk: Floats) -> Floats:
@@ -401,10 +413,10 @@ def axes_ring(arch: Arch) -> SampleRing | None:
     return None if arch.vector is None else SampleRing(tap_layer(arch.vector), arch.channels)
 
 
-def stream_state(arch: Arch) -> tuple[list[SampleRing], Pool]:
+def stream_state(arch: Arch, statistics: Callable[[Floats], Floats]) -> tuple[list[SampleRing], Pool]:
     """Return the state of a ``stream`` network between samples: a buffer before each layer, and the pooling."""
     rings = [SampleRing(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
-    return rings, Pool(arch.step, arch.pooled // arch.step, arch.features)
+    return rings, Pool(arch.step, arch.blocks, arch.layers[-1].filters, statistics)
 
 
 def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:

@@ -367,6 +367,7 @@ def model_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Classes", count(model.get("classes"))),
         ("Receptive field", samples("receptive_field")),
         ("Pooling", samples("pool")),
+        ("Pooled statistics", text(model.get("pooling"))),
         ("Span (past a decision sees)", samples("span")),
         ("Multiply-accumulates a window", count(model.get("macs_per_window"))),
         ("Multiply-accumulates a step", count(model.get("macs_per_step"))),

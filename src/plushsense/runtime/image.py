@@ -28,8 +28,10 @@ of everything after the head. The following sections come in this order:
   u8 baseline, u8 noise, u32 floor; for each rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; then for each
   of its terms: u8 signal, i8 sign, u8 times, u8 0, u32 threshold
 
-Images with a self-calibration (`plushsense.windows.self_calibration`) have a version of their own, because its code is
-compiled for such models only. Networks that compute a window again at every step (padding ``mirror``) have no image.
+Images with a self-calibration (`plushsense.windows.self_calibration`) have versions of their own, because its code is
+compiled for such models only; so have those with the pooling ``mean+deviation``, whose dense layer has the weights of
+the means, then of the deviations, for each class. Networks that compute a window again at every step (padding
+``mirror``) have no image.
 
 A patch replaces the dense layer of one image. Its head is that of an image with ``PLPT`` for ``PLSH``; then come the
 u32 CRC-32 in the head of that image, and the two sections of the new dense layer as in an image.
@@ -65,7 +67,8 @@ PATCH_MAGIC = b"PLPT"
 # 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score; 6: aligned weights
 # 10: four filters in a word
 IMAGE_VERSION = 10
-CALIBRATED_IMAGE_VERSION = 11  # of a model with a self-calibration
+CALIBRATED = 1  # added to the version of a model with a self-calibration
+DEVIATING = 2  # added to the version of a model with the pooling mean+deviation
 _WINDOW_VERSIONS = (7, 9)  # once of networks that computed a window again at every step
 _OTHER_SENSOR = 128  # added to the shift of a sensor that is no accelerometer
 SENSOR_BYTES = 200  # of the state of a sensor that calibrates itself
@@ -153,12 +156,13 @@ class IntegerModel:
     @property
     def image_version(self) -> int:
         """Version of the image, and of a patch of it."""
-        return CALIBRATED_IMAGE_VERSION if self.layout.self_calibration else IMAGE_VERSION
+        version = IMAGE_VERSION + CALIBRATED * bool(self.layout.self_calibration)
+        return version + DEVIATING * (self.network.arch.pooling != "mean")
 
     @property
     def pooled_steps(self) -> int:
         """Number of steps of which the pooling keeps a sum."""
-        return self.network.arch.pooled // self.network.arch.step
+        return self.network.arch.blocks
 
     @property
     def _units_per_ms(self) -> int:
@@ -340,7 +344,7 @@ def image_check(image: bytes) -> int:
             "The image is that of a window network, which has no C any more: train the network with --padding stream "
             "and export it."
         )
-    versions = (IMAGE_VERSION, CALIBRATED_IMAGE_VERSION)
+    versions = range(IMAGE_VERSION, IMAGE_VERSION + CALIBRATED + DEVIATING + 1)
     if image[:HEAD_BYTES] not in [image_head(image[HEAD_BYTES:], version=v) for v in versions]:
         raise BundleError("The image is damaged, or of another version of PlushSense: export the model again.")
     return int(struct.unpack_from("<I", image, HEAD_BYTES - 4)[0])
@@ -369,7 +373,7 @@ def patch_bytes(original: bytes | IntegerModel, adapted: IntegerModel) -> bytes:
 def memory_bytes(model: IntegerModel) -> int:
     """Return the bytes that a toy needs besides its ``plush_toy`` struct; equal to ``plush_memory_bytes`` in C."""
     arch, channels = model.network.arch, len(model.layout.channels)
-    features = arch.features
+    filters = arch.layers[-1].filters
     gate = model.rules.gate
     pieces = [4 * channels] * 3  # held, before, the sample being made
     pieces.append(4 * model.layout.input_kinds.count("gravity"))  # running means
@@ -380,9 +384,10 @@ def memory_bytes(model: IntegerModel) -> int:
         dilation = layer.dilation if layer.kernel > 1 else 1
         pieces.append(dilation * (layer.kernel + SPARE) * _filled(read))
         pieces.append(4 * dilation)  # sums under the taps
-    pieces.append(2 * features * model.pooled_steps)
-    pieces += [4 * features, 4 * arch.classes, 4 * arch.classes + 4]  # sums, logits, smoothed probabilities and known
-    pieces += [channels, 2 * features]  # which channels are valid, and the newest features of two positions
+    pieces.append(2 * filters * model.pooled_steps)
+    # Inputs of the dense layer, logits, smoothed probabilities and known.
+    pieces += [4 * arch.features, 4 * arch.classes, 4 * arch.classes + 4]
+    pieces += [channels, 2 * filters]  # which channels are valid, and the newest features of two positions
     health = model.rules.health
     if health.low or health.still_ms:
         pieces.append(4 * channels)  # the frame before

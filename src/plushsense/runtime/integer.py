@@ -24,6 +24,7 @@ from plushsense.models.reference import (
     axes_ring,
     check_windows,
     padded,
+    step_sums,
     stream_state,
     tap_layer,
     taps_of,
@@ -173,7 +174,11 @@ class IntegerLayer:
 
 @dataclass(frozen=True, eq=False)
 class IntegerDense:
-    """The last layer, on sums over time: ``weights`` (K, F) int8, ``bias`` (K,) int32, ``scale`` of sums to logits."""
+    """The last layer: ``weights`` (K, features) int8, ``bias`` (K,) int32, ``scale`` of sums to logits.
+
+    Its inputs are the sums of each filter over the pool, and with the pooling ``mean+deviation`` then twice the sum of
+    what the sums of its steps exceed their mean by, which is rounded down.
+    """
 
     weights: NDArray[np.int8]
     bias: Ints
@@ -181,11 +186,11 @@ class IntegerDense:
 
     @cached_property
     def matrix(self) -> Floats:
-        """The weights as (F, K)."""
+        """The weights as (features, K)."""
         return self.weights.T.astype(np.float64)
 
     def apply(self, pooled: Floats) -> Ints:
-        """Compute logits (N, K) in steps of 1/256 from sums over time (N, F)."""
+        """Compute logits (N, K) in steps of 1/256 from inputs (N, features)."""
         return self.scale.apply((pooled @ self.matrix).astype(np.int64) + self.bias)
 
 
@@ -259,12 +264,20 @@ class IntegerNetwork:
         return self.dense.apply(self.sums(x))
 
     def sums(self, x: NDArray[Any]) -> Floats:
-        """Compute the inputs of the dense layer, sums over time (N, F), of raw windows (N, C, T)."""
+        """Compute the inputs of the dense layer (N, features) of raw windows (N, C, T)."""
         z = self._first(x[:, :, x.shape[2] - self.arch.span :]).astype(np.float64)
         for layer, part in zip(self.arch.layers, self.layers, strict=True):
             taps = taps_of(padded(z, self.arch, layer.reach), layer)
             z = np.stack([part.apply(each.reshape(len(each), -1)) for each in taps])
-        return np.asarray(z.sum(axis=1))
+        return np.asarray(z.sum(axis=1)) if self.arch.pooling == "mean" else self.pooled(step_sums(z, self.arch))
+
+    def pooled(self, sums: Floats) -> Floats:
+        """Return the inputs (N, features) of the dense layer from the sums (N, blocks, F) of each step."""
+        total = np.asarray(sums.sum(axis=1))
+        if self.arch.pooling == "mean":
+            return total
+        beyond = np.maximum(sums - (total // self.arch.blocks)[:, None], 0.0)
+        return np.concatenate([total, 2.0 * beyond.sum(axis=1)], axis=1)
 
     def _first(self, x: NDArray[Any]) -> Bytes:
         """Return the inputs of the first convolution (N, T', C') of raw windows (N, C, T)."""
@@ -316,7 +329,7 @@ class IntegerStepper(Stepper):
         self._dense = self.network.dense if dense is None else replace(self.network, dense=dense).dense
 
     def _clear(self) -> None:
-        self._rings, self._pool = stream_state(self.arch.trunk)
+        self._rings, self._pool = stream_state(self.arch.trunk, self.network.pooled)
         self._axes = axes_ring(self.arch)
 
     def _values(self, samples: ArrayLike) -> NDArray[Any]:
@@ -333,8 +346,7 @@ class IntegerStepper(Stepper):
             if not len(taps):
                 return self.network._none()
             z = part.apply(taps)
-        # The pool returns means: multiply by its length and round to get the exact sums.
-        return self._dense.apply(np.rint(self._pool.feed(z) * self.arch.pooled))
+        return self._dense.apply(self._pool.feed(z))
 
 
 class IntegerWindowStepper(IntegerStepper):

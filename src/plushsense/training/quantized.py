@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import TrainingError
 from plushsense.models.arch import NORM_EPSILON, Arch, reflected
-from plushsense.models.net import Net, VectorNet
+from plushsense.models.net import Net, VectorNet, deviation
 from plushsense.runtime.integer import deployable, rounded_weights
 from plushsense.training.engine import Adam, slices, torch_threads
 from plushsense.training.fit import FittedNetwork, Weights
@@ -107,6 +107,7 @@ class Rounded:
         self._low, self._high = (torch.tensor(calibration[name], dtype=torch.float32) for name in ("low", "high"))
         self._tops = [torch.tensor(top, dtype=torch.float32).clamp_min(1e-6) for top in calibration["tops"]]
         self._means = [torch.tensor(mean, dtype=torch.float32) for mean in calibration["means"]]
+        self._deviation = torch.tensor(calibration.get("deviation", ()), dtype=torch.float32)
 
     def __call__(self, x: Tensor) -> Tensor:
         """Return the logits (N, K) of scaled windows (N, C, span)."""
@@ -129,8 +130,13 @@ class Rounded:
                 start = tensors[f"norm{i}.shift"] - tensors[f"norm{i}.mean"] * gain
             unit = gain * top / 255
             mean = gain * self._means[i + 1] + start
+        pooled = codes.mean(dim=2)
+        if arch.pooling != "mean":
+            pooled = torch.cat([pooled, deviation(codes, arch.step)], dim=1)
+            unit, start = torch.cat([unit, unit.abs()]), torch.cat([start, torch.zeros_like(start)])
+            mean = torch.cat([mean, gain.abs() * self._deviation])
         w, b = _rounded(tensors["dense.weight"], tensors["dense.bias"], unit, start, mean)
-        return F.linear(codes.mean(dim=2), w, b)
+        return F.linear(pooled, w, b)
 
     def logits(self, x: Tensor) -> Tensor:
         """Return the logits (N, K) without gradients, computed in parts."""

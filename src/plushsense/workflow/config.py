@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ArchError, ConfigError, check_known, check_seed
 from plushsense.core.toml import check_table, read_toml, refuse_unknown
-from plushsense.models.arch import NORMS, PADDINGS, parse_filters
+from plushsense.models.arch import NORMS, PADDINGS, POOLINGS, parse_filters
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import CONTEXT, TrainSpec, preset
@@ -39,6 +39,8 @@ class ModelSpec:
         step_s: time between two live decisions (above 0 to 60).
         pool_s: time over which a decision averages, with the padding ``stream`` (above 0 to 60; default: what fills the
             window).
+        pooling: statistics over that time: ``mean``, or ``mean+deviation``, as well how much the means of its steps
+            differ (default: ``mean+deviation`` with a vector layer, else ``mean``).
     """
 
     arch: str | None = None
@@ -47,6 +49,7 @@ class ModelSpec:
     norm: str = "batch"
     step_s: float = 0.05
     pool_s: float | None = None
+    pooling: str | None = None
 
     def __post_init__(self) -> None:
         for name, seconds in (("step_s", self.step_s), ("pool_s", self.pool_s)):
@@ -55,6 +58,12 @@ class ModelSpec:
         if self.padding is not None:
             check_known(self.padding, PADDINGS, "padding", ArchError)
         check_known(self.norm, NORMS, "norm", ArchError)
+        if self.pooling is not None:
+            check_known(self.pooling, POOLINGS, "pooling", ArchError)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return plain values for JSON, without the pooling ``mean``, of which earlier versions did not tell."""
+        return {key: value for key, value in asdict(self).items() if key != "pooling" or value != "mean"}
 
 
 @dataclass(frozen=True)
@@ -185,7 +194,7 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
 # The table of each setting of `train`, `evaluate` and `baselines`.
 _SETTINGS: dict[str, tuple[str, ...]] = {
     "windows": ("context", "window_s", "step_s", "longest_factor"),
-    "model": ("arch", "filters", "padding", "norm", "pool_s"),
+    "model": ("arch", "filters", "padding", "norm", "pool_s", "pooling"),
     "training": (
         *("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device"),
         *("augment", "turn_deg", "scaling", "weight_decay", "stride"),
@@ -205,8 +214,9 @@ def from_stored(config: Mapping[str, Any]) -> RunConfig:
     try:
         tables = {name: dict(config[name]) for name in ("windows", "model", "training", "evaluation", "anywhere")}
         tables["training"]["preset"] = config["preset"]
-        # `TrainSpec.to_dict` leaves it out, and so did earlier versions.
+        # `to_dict` leaves them out, and so did earlier versions.
         tables["training"].setdefault("stride", TrainSpec.stride)
+        tables["model"].setdefault("pooling", "mean")
     except (KeyError, TypeError, ValueError):
         raise ConfigError("The settings of this evaluation are incomplete. Evaluate again.") from None
     tables["windows"].pop("span_s", None)

@@ -313,10 +313,11 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
     contains the network as the bytes of a bundle, without objects of PyTorch.
 
     Args:
-        arch, filters, padding, norm: the network (see `Arch`). With arch None it is the default network, at the rate of
-            ``layout``; if T is less than its receptive field, its layers are shortened, so that they reach over half
-            of the window, with a warning. With padding None the preset's is used, which for most presets is ``stream``
-            and requires T to be at least the receptive field; ``mirror`` works with any T from 2.
+        arch, filters, padding, norm, pooling: the network (see `Arch`). With arch None it is the default network, at
+            the rate of ``layout``; if T is less than its receptive field, its layers are shortened, so that they reach
+            over half of the window, with a warning. With padding None the preset's is used, which for most presets is
+            ``stream`` and requires T to be at least the receptive field; ``mirror`` works with any T from 2. With
+            pooling None it is that of `plushsense.models.arch.default_pooling`.
         preset, epochs, batch, learning_rate: settings of the training; None: the value of the preset.
         channels: number of channels C in rows (N, C·T); default: that of ``layout``, else 1.
         layout: a `Layout`, its name or its path, if ``X`` has the values of `cut_windows`. Vectors are then rotated
@@ -349,6 +350,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         filters: Sequence[int] | str = DEFAULT_FILTERS,
         padding: str | None = None,
         norm: str = "batch",
+        pooling: str | None = None,
         preset: str = "people",
         epochs: int | None = None,
         batch: int | None = None,
@@ -362,6 +364,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         self.filters = filters
         self.padding = padding
         self.norm = norm
+        self.pooling = pooling
         self.preset = preset
         self.epochs = epochs
         self.batch = batch
@@ -522,6 +525,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             "filters": arch.filters,
             "padding": arch.padding,
             "norm": arch.norm,
+            "pooling": arch.pooling,
             "channels": arch.channels,
             "layout": None if bundle.layout.name == ANONYMOUS else bundle.layout,
         }
@@ -572,6 +576,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             classes=classes,
             padding=padding,
             norm=self.norm,
+            pooling=self.pooling,
             window=samples,
             step=1,
         )

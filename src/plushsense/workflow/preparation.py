@@ -27,6 +27,7 @@ from plushsense.models.arch import (
     VECTOR_FILTERS,
     VECTOR_SYMBOL,
     Arch,
+    default_pooling,
     parse_symbol,
     symbol_at_rate,
     symbol_within,
@@ -62,7 +63,7 @@ class Run:
         dataset: the data set as the network reads it: with its inputs and, if the classes are merged gestures, these.
         gestures: the classes.
         network: the network for the inputs and the number of classes.
-        model: the settings of ``network``, with symbol, filters and padding.
+        model: the settings of ``network``, with symbol, filters, padding and pooling.
         training: the settings of the training, with the augmentations.
         windows: the settings of the windows (see `trained_on` and `scored_on`).
         evaluation: its ``classes`` are labels if merged gestures were given.
@@ -111,7 +112,7 @@ class Run:
         """Return all settings as plain values for JSON."""
         names = ("windows", "model", "training", "evaluation", "live", "anywhere")
         tables = {name: asdict(getattr(self, name)) for name in names}
-        return {"preset": self.preset, **tables, "training": self.training.to_dict()}
+        return {"preset": self.preset, **tables, "model": self.model.to_dict(), "training": self.training.to_dict()}
 
     def outcome(self) -> dict[str, dict[str, object]]:
         """Return the settings that an evaluation's scores depend on, as plain values for JSON."""
@@ -121,7 +122,7 @@ class Run:
         return {
             **anywhere,
             "windows": asdict(self.windows),
-            "model": asdict(self.model),
+            "model": self.model.to_dict(),
             "training": _outcome_of(self.training),
             "evaluation": evaluation,
         }
@@ -132,13 +133,14 @@ class Run:
 
         The symbol of the network, its filters and padding, the context and the seed are left out.
         """
-        training = _usual(self.preset, self.trained_on.context, self.network.vector is not None)
+        has_vectors, own = self.network.vector is not None, self.outcome()
+        own["model"] = {**own["model"], "pooling": self.network.pooling}
+        training = _usual(self.preset, self.trained_on.context, has_vectors)
         usual = {
             "windows": asdict(WindowSpec()),
-            "model": asdict(ModelSpec()),
+            "model": asdict(ModelSpec(pooling=default_pooling(has_vectors))),
             "training": _outcome_of(training),
         }
-        own = self.outcome()
         apart = ("arch", "filters", "padding", "seed", "context")
         return ", ".join(
             f"{key} {text(value)}"
@@ -234,6 +236,7 @@ def prepare(dataset: Dataset | str | os.PathLike[str], config: RunConfig, warn: 
         step=layout.samples(model.step_s),
         pool=None if model.pool_s is None else layout.samples(model.pool_s),
         vectors=len(layout.vectors),
+        pooling=model.pooling,
     )
     return Run(
         dataset,
@@ -241,7 +244,7 @@ def prepare(dataset: Dataset | str | os.PathLike[str], config: RunConfig, warn: 
         network,
         config.preset,
         config.windows,
-        replace(model, arch=symbol, filters=filters, padding=padding),
+        replace(model, arch=symbol, filters=filters, padding=padding, pooling=network.pooling),
         with_preset(config, symbol).training,
         replace(config.evaluation, classes=classes),
         config.live,

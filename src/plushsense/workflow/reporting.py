@@ -167,6 +167,7 @@ def card(arch: Arch, **more: Any) -> dict[str, object]:
     seconds = {"receptive_field_s": arch.receptive_field / rate, "span_s": arch.span / rate} if rate else {}
     return {
         **arch.to_dict(),
+        "pooling": arch.pooling,
         "parameters": arch.parameters,
         "receptive_field": arch.receptive_field,
         "span": arch.span,

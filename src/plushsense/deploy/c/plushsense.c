@@ -301,18 +301,30 @@ static uint32_t checksum(const uint8_t *bytes, uint32_t n)
     return ~sum;
 }
 
+/* Whether the dense layer of a model reads deviations, too. */
+PLUSH_SMALL static int deviates(const uint8_t *model)
+{
+    return word_at(model + 4) == PLUSH_IMAGE_VERSION + 2;
+}
+
 /* A model, or a patch of one: they begin with the same head but for its first four bytes. */
 PLUSH_SMALL_APART
 static plush_status check(const uint8_t *model, uint32_t bytes, const char *magic)
 {
     if (model == NULL || bytes < HEAD_BYTES || memcmp(model, magic, 4) != 0)
         return PLUSH_NOT_A_MODEL;
-    if (word_at(model + 4) != PLUSH_IMAGE_VERSION) /* 16 bits, and 16 zeros */
+    if (word_at(model + 4) != PLUSH_IMAGE_VERSION && !deviates(model)) /* 16 bits, and 16 zeros */
         return PLUSH_OTHER_VERSION;
     if (word_at(model + 8) > bytes || word_at(model + 8) <= HEAD_BYTES ||
         checksum(model + HEAD_BYTES, word_at(model + 8) - HEAD_BYTES) != word_at(model + 12))
         return PLUSH_DAMAGED;
     return PLUSH_OK;
+}
+
+/* How many numbers the dense layer reads: of each feature the mean, and for some models the deviation. */
+static uint32_t pooled(const plush_toy *toy)
+{
+    return (uint32_t)toy->features << toy->deviations;
 }
 
 PLUSH_SMALL static uint32_t fill_up(uint32_t n)
@@ -559,7 +571,7 @@ PLUSH_SMALL static int read_dense_and_names(plush_toy *toy, source *from)
     uint32_t i;
 
     toy->dense = next_scales(from, toy->classes);
-    toy->dense_weights = next_bytes(from, (uint32_t)toy->classes * toy->features);
+    toy->dense_weights = next_bytes(from, toy->classes * pooled(toy));
     toy->classes_told = next_bytes(from, toy->classes);
     if (toy->dense == NULL || toy->dense_weights == NULL || toy->classes_told == NULL)
         return 0;
@@ -676,6 +688,7 @@ PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
 
     from.at = model + HEAD_BYTES;
     from.left = word_at(model + 8) - HEAD_BYTES;
+    toy->deviations = (uint8_t)deviates(model);
     if (!read_head(toy, &from) || !read_input_plan(toy, &from) || !read_sensors(toy, &from) || !read_vectors(toy, &from))
         return 0;
     span = (uint32_t)toy->step * toy->blocks + (toy->vectors != 0 ? toy->vector_taps - 1u : 0u);
@@ -725,7 +738,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         layer->tap_sums = (uint32_t *)take(memory, &used, UINT32_C(4) * layer->dilation);
     }
     toy->sums = (uint16_t *)take(memory, &used, UINT32_C(2) * toy->features * toy->blocks);
-    toy->total = (uint32_t *)take(memory, &used, 4u * toy->features);
+    toy->total = (uint32_t *)take(memory, &used, 4u * pooled(toy));
     toy->logits = (int32_t *)take(memory, &used, 4u * toy->classes);
     toy->smooth = (int32_t *)take(memory, &used, 4u * (toy->classes + 1u));
     if (has_gate(toy)) {
@@ -1229,16 +1242,35 @@ static int is_idle(const plush_toy *toy, uint32_t gesture)
     return (toy->classes_told[gesture] & TOLD_IDLE) != 0;
 }
 
+/* Of each feature, twice what the sums of its blocks exceed their mean by: how much it changes over time. */
+PLUSH_APART
+static void deviations(plush_toy *toy)
+{
+    uint32_t features = toy->features, f, left;
+
+    for (f = 0; f < features; f++) {
+        const uint16_t *sum = toy->sums + f;
+        uint32_t mean = toy->total[f] / toy->blocks, beyond = 0;
+
+        for (left = toy->blocks; left != 0; left--, sum += features)
+            if (*sum > mean)
+                beyond += *sum - mean;
+        toy->total[features + f] = 2 * beyond;
+    }
+}
+
 static void dense(plush_toy *toy)
 {
     const uint8_t *scale = toy->dense, *w = toy->dense_weights;
-    uint32_t k, f;
+    uint32_t inputs = pooled(toy), k, f;
 
+    if (toy->deviations)
+        deviations(toy);
     for (k = 0; k < toy->classes; k++, scale += SCALE_BYTES) {
         uint32_t sum = le32(scale);
         int32_t t;
 
-        for (f = 0; f < toy->features; f++)
+        for (f = 0; f < inputs; f++)
             sum += toy->total[f] * ((uint32_t)*w++ - WEIGHT_ZERO);
         t = within(shift_down(as_signed(sum), scale[6]), -32768, 32767);
         t = shift_down(t * (int32_t)le16(scale + 4) + (int32_t)half(scale[7]), scale[7]);
@@ -2198,7 +2230,7 @@ PLUSH_SMALL uint32_t plush_model_id(const plush_toy *toy)
 
 PLUSH_SMALL plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_bytes)
 {
-    uint32_t scales = SCALE_BYTES * toy->classes, weights = (uint32_t)toy->classes * toy->features;
+    uint32_t scales = SCALE_BYTES * toy->classes, weights = toy->classes * pooled(toy);
     const uint8_t *layer;
 
     if (toy->held == NULL)

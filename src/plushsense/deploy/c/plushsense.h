@@ -197,7 +197,7 @@ typedef struct plush_toy {
 
     uint8_t heard, running;  /* clock: a frame has come; samples are being made */
     uint8_t follows;         /* the frame before was not left out */
-    uint8_t mean_shift, vector_newest;
+    uint8_t mean_shift, vector_newest, deviations;
     uint8_t gate_seen, gate_newest, gate_doubt;
     uint8_t faulty, compared; /* health: there is a fault; there was a frame to compare with */
     uint8_t wrong, good;      /* some channel is wrong since `wrong_ms`; all is good since `good_ms` */
@@ -228,7 +228,7 @@ typedef struct plush_toy {
     int16_t *axes;           /* of the newest samples */
     int32_t *across;         /* horizontal parts of the vectors of the vector layer's kernels */
     uint16_t *sums;          /* blocks x features */
-    uint32_t *total;         /* of each feature: its sum over all blocks */
+    uint32_t *total;         /* of each feature: its sum over all blocks; then, if `deviations`, how much these differ */
     int32_t *logits;         /* of each class, in steps of 1/256 */
     int32_t *smooth;         /* of each class: probability in steps of 2^-27; after them the highest logit in 2^-20 */
     int32_t *gate_inputs, *gate_state; /* the inputs of the newest samples, what it knows of each signal, */

@@ -85,12 +85,17 @@ CONVERTERS: dict[str, Format] = {
 }
 
 
-def refuse_vectors(arch: Arch, suffix: str) -> None:
-    """Raise ArchError for a network with a vector layer, which a format with this suffix cannot hold here."""
+def refuse_unwritable(arch: Arch, suffix: str) -> None:
+    """Raise ArchError for a network with a vector layer or deviations, which this suffix cannot hold here."""
     if arch.vector is not None:
         raise ArchError(
             f"{arch.title} begins with a vector layer, which PlushSense does not write to {suffix} files: take the "
             "format onnx, onnx-int8 or the C of plushsense export, or train a network without a vector layer."
+        )
+    if arch.pooling != "mean":
+        raise ArchError(
+            f"{arch.title} has the pooling '{arch.pooling}', which PlushSense does not write to {suffix} files: take "
+            "the format onnx, onnx-int8 or the C of plushsense export, or train it with --pooling mean."
         )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import need
-from plushsense.deploy.convert import Conversion, ConversionJob, describe, refuse_vectors
+from plushsense.deploy.convert import Conversion, ConversionJob, describe, refuse_unwritable
 from plushsense.models.arch import NORM_EPSILON, Arch
 from plushsense.models.bundle import Bundle
 from plushsense.windows.features import InputUnits
@@ -78,5 +78,5 @@ def _padding(arch: Arch) -> dict[str, Any]:
 
 def to_matlab(job: ConversionJob) -> Conversion:
     """Write the parameters of the float network."""
-    refuse_vectors(job.bundle.arch, ".mat")
+    refuse_unwritable(job.bundle.arch, ".mat")
     return Conversion(mat_bytes(parameters(job.bundle)), None, (_UNTRIED,))

@@ -127,7 +127,7 @@ def float_model(bundle: Bundle) -> bytes:
             z = g.add("Transpose", f"norm{i}.rows", z, perm=[0, 2, 1])
             z = g.add("LayerNormalization", f"norm{i}.normed", z, gain, shift, axis=-1, epsilon=NORM_EPSILON)
             z = g.add("Transpose", f"norm{i}", z, perm=[0, 2, 1])
-    z = _mean(g, z)
+    z = _pooled(g, arch, z)
     w, b = (g.constant(n, bundle.weights[n]) for n in ("dense.weight", "dense.bias"))
     g.add("Gemm", LOGITS, z, w, b, transB=1)
     g.add("Softmax", PROBABILITIES, LOGITS, axis=-1)
@@ -210,15 +210,23 @@ def _invariants(
     return g.add("Concat", "invariants", *outputs, axis=1)
 
 
-def _mean(g: OnnxGraph, z: str) -> str:
-    return g.add("Flatten", "pooled", g.add("GlobalAveragePool", "mean", z), axis=1)
+def _pooled(g: OnnxGraph, arch: Arch, z: str, *image: int) -> str:
+    """Add the statistics over time, (N, features), of activations (N, F, T), or of an image with this height."""
+    mean = g.add("GlobalAveragePool", "mean", z)
+    if arch.pooling == "mean":
+        return g.add("Flatten", "pooled", mean, axis=1)
+    shape = [*image, arch.step]
+    z = g.add("AveragePool", "step.means", z, kernel_shape=shape, strides=shape)
+    z = g.add("Abs", "apart", g.add("Sub", "from.mean", z, mean))
+    both = g.add("Concat", "statistics", mean, g.add("GlobalAveragePool", "deviation", z), axis=1)
+    return g.add("Flatten", "pooled", both, axis=1)
 
 
 def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     """Return the integer network as ONNX with QuantizeLinear and DequantizeLinear.
 
     Activations have the uint8 codes of `IntegerNetwork` with scale 1; the scale of each filter is applied to its
-    weights. The mean over time and the dense layer are computed in float32, the latter with 8-bit weights.
+    weights. The statistics over time and the dense layer are computed in float32, the latter with 8-bit weights.
 
     Weights are uint8 with the zero point `WEIGHT_ZERO`: on processors without VNNI, onnxruntime and others add pairs of
     products of uint8 and int8 in 16 bits, which saturate without an error.
@@ -259,7 +267,7 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
         z = quantized(g.add("Relu", f"relu{i}", z), f"layer{i}")
     # Over images, because OpenVINO 2026.4 averages 8-bit codes (N, F, T) over time to 0 in all but the first F windows.
     z = g.add("Unsqueeze", "image", z, g.constant("image.axis", np.array([2], dtype=np.int64)))
-    z = _mean(g, z)
+    z = _pooled(g, arch, z, 1)
     dense = network.dense
     scales = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
     w = weights_of("dense.weight", dense.weights, scales * arch.pooled)

@@ -29,7 +29,7 @@ from plushsense.deploy.convert import (
     describe,
     in_float32,
     input_codes,
-    refuse_vectors,
+    refuse_unwritable,
     refuse_window,
     sum_scales,
 )
@@ -294,7 +294,7 @@ def run_model(model: bytes, values: Floats) -> NDArray[np.float32]:
 
 def to_tflite(job: ConversionJob) -> Conversion:
     """Convert the float network."""
-    refuse_vectors(job.bundle.arch, ".tflite")
+    refuse_unwritable(job.bundle.arch, ".tflite")
     model = float_model(job.bundle)
     return compared(job, model, run_model(model, job.values), "LiteRT", (_input_note(job.bundle),))
 
@@ -302,7 +302,7 @@ def to_tflite(job: ConversionJob) -> Conversion:
 def to_integer_tflite(job: ConversionJob) -> Conversion:
     """Convert the network with int8 convolutions; its outputs are close to those of the C, not bit-identical."""
     refuse_window(job.bundle.arch, "tflite-int8")
-    refuse_vectors(job.bundle.arch, ".tflite")
+    refuse_unwritable(job.bundle.arch, ".tflite")
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
     logits, expected = run_model(model, job.values), network.forward(job.windows) / 256

@@ -85,8 +85,9 @@ def is_misprint(arch: str, filters: str) -> bool:
 
 def count_parameters(arch: str, filters: str) -> int:
     """Return a network's number of parameters with the paper's 11 channels and 18 classes."""
-    size = {"channels": PAPER_CHANNELS, "classes": PAPER_CLASSES}
-    return Arch.parse(arch, list(_filters(filters)), **size, padding="mirror", norm="batch").parameters
+    return Arch.parse(
+        arch, list(_filters(filters)), channels=PAPER_CHANNELS, classes=PAPER_CLASSES, padding="mirror", norm="batch"
+    ).parameters
 
 
 def agrees(printed: str, count: int) -> bool:

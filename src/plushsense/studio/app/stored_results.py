@@ -284,7 +284,7 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
     people = table["subjects"]
     # Recordings at rest, of which there are more, are scored apart where people are left out.
     recordings = sum(one["recordings"] for one in people) if apart else table["by_recording"]["recordings"]
-    network = (model["symbol"], *model["filters"], model["padding"], model.get("norm"))
+    network = (model["symbol"], *model["filters"], model["padding"], model.get("norm"), model.get("pooling", "mean"))
     # The context that was asked for, as a bundle states it; without streams, another one is used.
     asked = config["evaluation"]["train_context"] or config["windows"]["context"]
     return [

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import numpy as np
 import torch
@@ -79,6 +80,7 @@ class FastNet:
         self._threads, self._shared = ThreadPool(threads), BufferPool()
         self._scratch = [BufferPool() for _ in range(self._threads.threads)]
         self._ones = torch.ones(1, arch.span)
+        self._steps = _step_means(net.arch, arch.pooled)
         self._edges: list[tuple[int, int]] = []
         self.parameters = [t for one in self._layers for t in (one.w, one.bias, one.gain, one.shift)]
         self.parameters += [self._dense, self._dense_bias]
@@ -112,7 +114,7 @@ class FastNet:
         self._cut(len(y))
         passes, pooled = self._forward(fill)
         last = passes[-1]
-        features = pooled * last.a + last.b
+        features = _features(pooled, last.a, last.b)
         logits = torch.addmm(self._dense_bias, features, self._dense.t())
         logs = F.log_softmax(logits, dim=1)
         loss = F.nll_loss(logs, y)
@@ -147,11 +149,12 @@ class FastNet:
                 layer.way.forward(x, *ready[at], self._place(at, out), space, spectrum)
                 self._finish(at, out)
                 x = out
-            return self._rows(len(self._layers) - 1, x).mean(0)
+            rows = self._rows(len(self._layers) - 1, x)
+            mean = rows.mean(0)
+            return mean if self._steps is None else torch.cat([mean, self._deviations(rows).abs().mean(0)], dim=1)
 
         pooled = torch.cat(self._threads.each(read, len(self._edges)))
-        a, b = folded[-1]
-        return torch.addmm(self._dense_bias, pooled * a + b, self._dense.t())
+        return torch.addmm(self._dense_bias, _features(pooled, *folded[-1]), self._dense.t())
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
         """Return a copy of the weights, in the form of ``models/reference`` and of bundles."""
@@ -250,8 +253,22 @@ class FastNet:
             else self._scratch[thread].take("spectrum", *shape)
         )
 
+    def _deviations(self, rows: Tensor) -> Tensor:
+        """Return the deviations (blocks, N, F) of the means of each step from their mean, for rows (T', N, F)."""
+        steps, (after, *shape) = cast(Tensor, self._steps), rows.shape
+        means = (steps @ rows.reshape(after, -1)).view(-1, *shape)
+        return means - means.mean(0)
+
+    def _slope_of_deviation(self, i: int, slope: Tensor) -> Tensor:
+        """Return the gradient (T', N, F) of the output rows of chunk ``i`` from that of their deviations (N, F)."""
+        last = len(self._layers)
+        signs = self._deviations(self._rows(last - 1, self._held(last, i))).sign_()
+        steps = cast(Tensor, self._steps)
+        each = (signs - signs.mean(0)) * (slope / len(steps))
+        return (steps.t() @ each.view(len(steps), -1)).view(-1, *slope.shape)
+
     def _forward(self, fill: Fill) -> tuple[list[_Pass], Tensor]:
-        """Return the values that each layer keeps, and the output of the last layer averaged over time (N, F)."""
+        """Return the values that each layer keeps, and the statistics (N, features) of the output of the last layer."""
         chunks, windows = len(self._edges), self._edges[-1][1]
 
         def read(i: int, lane: int, thread: int) -> None:
@@ -272,7 +289,13 @@ class FastNet:
             a = layer.gain * (var + NORM_EPSILON).rsqrt()
             passes.append(_Pass(ready, mean, var, a, layer.shift - mean * a))
             pooled = [s / layer.way.plan.after for s, _ in sums]
-        return passes, torch.cat(pooled)
+        if self._steps is None:
+            return passes, torch.cat(pooled)
+
+        def deviation(i: int, lane: int, thread: int) -> Tensor:
+            return self._deviations(self._rows(len(self._layers) - 1, self._held(len(self._layers), i))).abs().mean(0)
+
+        return passes, torch.cat([torch.cat(pooled), torch.cat(self._threads.each(deviation, chunks))], dim=1)
 
     def _forward_chunk(self, at: int, w: Tensor, bias: Tensor, i: int, lane: int, thread: int) -> tuple[Tensor, Tensor]:
         """Compute layer ``at`` for chunk ``i``; return the `_sums` of its output."""
@@ -290,9 +313,14 @@ class FastNet:
 
     def _backward(self, passes: list[_Pass], pooled: Tensor, slope: Tensor) -> None:
         """Compute the gradients of all layers from ``slope`` (N, F), the gradient of the inputs of the dense layer."""
-        chunks, windows = len(self._edges), self._edges[-1][1]
-        da, db = (slope * pooled).sum(0), slope.sum(0)
-        flat = slope * passes[-1].a / self._layers[-1].way.plan.after
+        chunks, windows, last = len(self._edges), self._edges[-1][1], passes[-1]
+        filters = len(last.a)
+        da, db = (slope * pooled).sum(0), slope[:, :filters].sum(0)
+        flat, deviation = slope[:, :filters] * last.a / self._layers[-1].way.plan.after, None
+        if self._steps is not None:
+            # A deviation is multiplied by the size of the gain.
+            da = da[:filters] + da[filters:] * last.a.sign()
+            deviation = slope[:, filters:] * last.a.abs()
         for at in range(len(self._layers) - 1, -1, -1):
             layer, here = self._layers[at], passes[at]
             count = windows * layer.way.plan.after
@@ -303,7 +331,7 @@ class FastNet:
             beta = straight * layer.gain * inverse.pow(3) / -count
             alpha = -here.a * db / count - beta * here.mean
             totals: dict[int, Tensor] = {}
-            above = flat if at + 1 == len(self._layers) else None
+            above = (flat, deviation) if at + 1 == len(self._layers) else None
             work = partial(self._backward_chunk, at, here.w, above, alpha, beta, totals)
             bias = _added(self._threads.each(work, chunks))
             total = totals[0]
@@ -322,7 +350,7 @@ class FastNet:
         self,
         at: int,
         w: Tensor,
-        above: Tensor | None,
+        above: tuple[Tensor, Tensor | None] | None,
         alpha: Tensor,
         beta: Tensor,
         totals: dict[int, Tensor],
@@ -332,8 +360,8 @@ class FastNet:
     ) -> Tensor:
         """Propagate the gradient of chunk ``i`` back through layer ``at``; return the gradient of the bias.
 
-        ``above`` (N, F), only for the last layer, is the gradient of each of its output rows. The gradient of the
-        weights is added to the tensor of ``lane`` in ``totals``.
+        ``above``, only for the last layer, is the gradient (N, F) of each of its output rows, and that of their
+        deviation. The gradient of the weights is added to the tensor of ``lane`` in ``totals``.
         """
         layer, space, size = self._layers[at], self._scratch[thread], self._size(i)
         planned = layer.way.plan
@@ -344,8 +372,10 @@ class FastNet:
             torch.addcmul(self._gradient(at + 1, i), rows, beta, out=inner)
             inner += alpha
         else:
-            start, end = self._edges[i]
-            torch.addcmul((above[start:end] + alpha).expand(rows.shape), rows, beta, out=inner)
+            (start, end), (flat, deviation) = self._edges[i], above
+            torch.addcmul((flat[start:end] + alpha).expand(rows.shape), rows, beta, out=inner)
+            if deviation is not None:
+                inner += self._slope_of_deviation(i, deviation[start:end])
         torch.ops.aten.threshold_backward.grad_input(inner, rows, 0, grad_input=inner)
         dz[planned.after :].zero_()
         x, spectrum = self._held(at, i), self._spectrum(at, i, thread)
@@ -369,6 +399,25 @@ class FastNet:
         """Return the part of `_slope` that belongs to the output rows of the preceding layer, or to the inputs."""
         planned = self._layers[at].way.plan
         return self._slope(at, i)[planned.front : planned.front + planned.before]
+
+
+def _step_means(arch: Arch, rows: int) -> Tensor | None:
+    """Return a matrix (blocks, rows) that averages the rows of each step of the pool; None if only the mean is needed.
+
+    Where a stride leaves rows out, steps have unequal numbers of rows.
+    """
+    if arch.pooling == "mean":
+        return None
+    blocks = min(arch.blocks, rows)
+    of = torch.arange(rows) * blocks // rows
+    return F.normalize(F.one_hot(of, blocks).t().float(), p=1.0)
+
+
+def _features(pooled: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Return the inputs of the dense layer: statistics (N, features) of r become those of a · r + b."""
+    if pooled.shape[1] == len(a):
+        return pooled * a + b
+    return pooled * torch.cat([a, a.abs()]) + torch.cat([b, torch.zeros_like(b)])
 
 
 def _added(parts: list[Tensor]) -> Tensor:
