@@ -150,6 +150,7 @@ DEFAULT_FILTERS = (8, 12, 16)
 VECTOR = "v"  # before the kernel length of a vector layer
 VECTOR_SYMBOL = "v14_17d2_19d4"
 VECTOR_FILTERS = (6, 16, 16)
+_FEWEST_STEPS = 10  # of a pool whose deviation is read by default: half a second
 
 PAPER_FILTERS: tuple[tuple[int, ...], ...] = (
     (4, 6, 8, 8),
@@ -353,8 +354,9 @@ class Arch:
         if shape.vector is not None:
             vector, counts = VectorLayer(shape.vector, counts[0], vectors), counts[1:]
         layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape.layers, counts, strict=False))
-        settings["pooling"] = settings.get("pooling") or default_pooling(vector is not None)
-        return cls(layers, vector=vector, **cast(Any, settings))
+        pooling = settings.pop("pooling", None)
+        arch = cls(layers, vector=vector, **cast(Any, settings))
+        return replace(arch, pooling=cast(Any, pooling or default_pooling(arch)))
 
     @property
     def symbol(self) -> str:
@@ -520,13 +522,13 @@ class Arch:
         return cls.parse(spec, filters, **{"pooling": "mean"} | {k: v for k, v in table.items() if k in settings})
 
 
-def default_pooling(has_vectors: bool) -> Pooling:
-    """Return the pooling of a network for which none is given.
+def default_pooling(arch: Arch) -> Pooling:
+    """Return the pooling for a network where none is given: ``mean+deviation`` with a vector layer, else ``mean``.
 
-    With a vector layer, the deviation reads people left out better (docs/measurements/people.md). Without one it was
-    not measured on real recordings, and networks have the mean alone, as in the paper.
+    With a vector layer, the deviation reads people left out better (docs/measurements/people.md), but for a pool of few
+    steps. Without one it was not measured on real recordings, and networks have the mean alone, as in the paper.
     """
-    return "mean+deviation" if has_vectors else "mean"
+    return "mean+deviation" if arch.vector is not None and arch.blocks >= _FEWEST_STEPS else "mean"
 
 
 def reflected(length: int, left: int) -> NDArray[np.intp]:

@@ -40,7 +40,7 @@ class ModelSpec:
         pool_s: time over which a decision averages, with the padding ``stream`` (above 0 to 60; default: what fills the
             window).
         pooling: statistics over that time: ``mean``, or ``mean+deviation``, as well how much the means of its steps
-            differ (default: ``mean+deviation`` with a vector layer, else ``mean``).
+            differ (default: ``mean+deviation`` with a vector layer and 10 steps or more, else ``mean``).
     """
 
     arch: str | None = None

@@ -19,7 +19,15 @@ from plushsense.core.gestures import Gesture, GestureSet, plain_label
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Channel, CsvFormat, Layout, load_layout
 from plushsense.core.version import __version__
 from plushsense.deploy.quantize import calibration
-from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch, parse_symbol, symbol_at_rate, symbol_within
+from plushsense.models.arch import (
+    DEFAULT_FILTERS,
+    DEFAULT_SYMBOL,
+    Arch,
+    default_pooling,
+    parse_symbol,
+    symbol_at_rate,
+    symbol_within,
+)
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
@@ -589,7 +597,8 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             if padding == "stream":
                 raise ArrayError(f"{problem}, or padding='mirror'.")
             warnings.warn(f"{problem}.", stacklevel=3)
-        return replace(arch, step=min(5, free), pool=None)
+        arch = replace(arch, step=min(5, free), pool=None)
+        return arch if self.pooling else replace(arch, pooling=default_pooling(arch))
 
     def _settings(self) -> dict[str, Any]:
         """Return the training settings as a bundle stores them for `from_bundle`."""

@@ -138,7 +138,7 @@ class Run:
         training = _usual(self.preset, self.trained_on.context, has_vectors)
         usual = {
             "windows": asdict(WindowSpec()),
-            "model": asdict(ModelSpec(pooling=default_pooling(has_vectors))),
+            "model": asdict(ModelSpec(pooling=default_pooling(self.network))),
             "training": _outcome_of(training),
         }
         apart = ("arch", "filters", "padding", "seed", "context")
