@@ -70,4 +70,19 @@ def test_a_stored_evaluation_keeps_its_stride(dataset: Dataset) -> None:
     for stride in (1, 2, 4):
         stored = prepare(dataset, from_settings(stride=stride)).to_json()
         assert from_stored(stored).training.stride == stride
-    assert prepare(dataset, from_settings()).training.stride == 4
+    assert prepare(dataset, from_settings()).training.stride == 2, "a network with a vector layer"
+    assert prepare(dataset, from_settings(context="anywhere")).training.stride == 4
+    assert prepare(dataset, from_settings(arch="14d1_19d2_19d4")).training.stride == 4
+
+
+def test_a_stored_evaluation_keeps_its_pooling(dataset: Dataset) -> None:
+    run = prepare(dataset, from_settings())
+    assert (run.network.pooling, run.changes) == ("mean+deviation", "")
+    assert prepare(dataset, from_stored(run.to_json())).network == run.network
+    mean = prepare(dataset, from_settings(pooling="mean"))
+    assert (mean.network.pooling, mean.changes) == ("mean", "pooling mean") and mean.id != run.id
+    # As earlier versions stored it.
+    assert "pooling" not in mean.to_json()["model"]
+    assert prepare(dataset, from_stored(mean.to_json())).network == mean.network
+    few = prepare(dataset, from_settings(pool_s=0.45))
+    assert (few.network.pooling, few.changes) == ("mean", "pool_s 0.45")

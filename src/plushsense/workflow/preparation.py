@@ -174,8 +174,9 @@ def _outcome_of(training: TrainSpec) -> dict[str, Any]:
 def _usual(name: str, context: str, has_vectors: bool) -> TrainSpec:
     """Return a preset as it trains a network, with a vector layer or without, on windows of a context."""
     usual = preset_for(name, has_vectors)
-    fewer = has_vectors and context == ANYWHERE
-    return usual.with_epochs(ANYWHERE_EPOCHS.get(name, usual.epochs)) if fewer else usual
+    if not has_vectors or context != ANYWHERE:
+        return usual
+    return replace(usual.with_epochs(ANYWHERE_EPOCHS.get(name, usual.epochs)), stride=PRESETS[name].stride)
 
 
 def with_preset(config: RunConfig, symbol: str) -> RunConfig:
