@@ -102,7 +102,8 @@ def test_import_info_train_evaluate_report(cli: Cli, recordings: Path, tmp_path:
     found = cli("import", recordings, ds, "--layout", "accel-3", "--json").json
     assert (found["recordings"], found["subjects"], found["streams"]) == (30, 5, 5)
     assert found["rejected"] == found["warnings"] == []
-    assert cli("info", ds, "--json").json["located_in_stream"] == 30
+    info = cli("info", ds, "--json").json
+    assert (info["located_in_stream"], info["trimmed"], info["offsets"]) == (30, 0, {})
     model = tmp_path / "m.plush"
     trained = cli("train", ds, "--out", model, "--filters", "4,4,4", "--epochs", "8", "--json").json
     assert trained["bundle"] == str(model)

@@ -253,6 +253,21 @@ def test_a_vector_layer_is_written_to_onnx_only(layout: str, tmp_path: Path, onn
             convert(bundle, tmp_path / "o", name)
 
 
+def test_deviations_are_written_to_onnx_only(tmp_path: Path, onnx_here: None) -> None:
+    bundle = made(("9d1_5d3", (5, 7), "accel-3", {"window": 60, "pooling": "mean+deviation"}))
+    raw = made_up_windows(bundle, 20)
+    assert_floats(as_onnx.run_model(as_onnx.float_model(bundle), values(bundle, raw)), bundle, raw)
+    network = integer_network(bundle)
+    found, expected = (
+        as_onnx.run_model(as_onnx.integer_model(bundle, network), values(bundle, raw)),
+        network.forward(raw),
+    )
+    assert found is not None and np.abs(found - expected / 256).max() < 0.01 * max(1.0, np.abs(expected).max() / 256)
+    for name in ("tflite", "tflite-int8", "matlab"):
+        with pytest.raises(ArchError, match="has the pooling 'mean.deviation', which .* train it with --pooling mean"):
+            convert(bundle, tmp_path / "o", name)
+
+
 def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> None:
     bundle = made(("14d1_19d2_19d4", (8, 12, 16), "accel-3", {}))
     stream = real_data / "makeability-gestures" / "P07" / "fulldatastream.csv"

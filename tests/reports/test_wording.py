@@ -88,3 +88,12 @@ def test_what_more_people_would_add_stands_in_the_protocol_if_it_was_measured() 
     learning = {"points": points, "more": 2, "gain": 0.012, "ci95": [-0.004, 0.031]}
     answer = dict(wording.describe_protocol({"split": "by-subject:5", "learning": learning}))["More people"]
     assert "by +0.012 (95 % interval -0.004 to +0.031)" in answer and "over 7, 13, 20 people" in answer
+
+
+def test_what_marks_and_the_layout_changed() -> None:
+    dataset = {"recordings": 1200, "excluded": 24, "trimmed": 310, "offsets": {"x": 330.0, "y": 331.5}}
+    answers = dict(wording.describe_protocol({"split": "by-subject:5", "dataset": dataset}))
+    told = "24 left out and 310 trimmed. Readings that stand for zero: x 330, y 331.5."
+    assert answers["Data"] == f"Of 1\N{NARROW NO-BREAK SPACE}200 recordings, {told}"
+    # As earlier versions stored it.
+    assert "Data" not in dict(wording.describe_protocol({"split": "by-subject:5", "dataset": {"recordings": 3}}))

@@ -546,6 +546,8 @@ class Dataset:
             "simulated": self.head.simulated,
             "recordings": len(self.recordings),
             "excluded": len(self.recordings) - len(self.used),
+            "trimmed": sum(r.stop - r.start < r.rows for r in self.used),
+            "offsets": {c.name: c.offset for c in self.layout.channels if c.offset},
             "subjects": len(self.subjects),
             "streams": len(self.streams),
             "located_in_stream": sum(r.stream_row >= 0 for r in self.recordings),

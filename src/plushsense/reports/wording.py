@@ -69,6 +69,8 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Seeds", f"{text(seeds)} ({runs})"),
         ("Folds", count(folds) + (f", {count(sum(sizes))} windows scored" if sizes else "")),
     ]
+    if "trimmed" in (dataset := evaluation.get("dataset") or {}):
+        answers.append(("Data", describe_decisions(dataset)))
     if evaluation.get("nobody"):
         how = "reported apart" if averaged_over(evaluation) == "subjects" else "counted like all others"
         rest = f"Recordings of nobody (at rest) are spread over the folds by recording and {how}."
@@ -88,6 +90,15 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
     if audit := evaluation.get("leakage"):
         answers.append(("Leakage audit", describe_leakage(audit)))
     return answers
+
+
+def describe_decisions(dataset: Mapping[str, Any]) -> str:
+    """Describe what marks and the layout of a data set (`plushsense.dataset.store.Dataset.summary`) changed."""
+    zeros = ", ".join(f"{name} {value:g}" for name, value in dataset["offsets"].items())
+    return (
+        f"Of {count(dataset['recordings'], 'recordings')}, {count(dataset['excluded'])} left out and "
+        f"{count(dataset['trimmed'])} trimmed." + (f" Readings that stand for zero: {zeros}." if zeros else "")
+    )
 
 
 def describe_learning(learning: Mapping[str, Any]) -> str:
