@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.studio.app.jobs import DONE, INCOMING, REFUSED, RUNNING, STOPPED, UNFINISHED, Jobs, StudioJob
+from plushsense.studio.app.jobs import DONE, INCOMING, REFUSED, RUNNING, STOPPED, UNFINISHED, WARM, Jobs, StudioJob
 from plushsense.studio.app.workspace import WORK, Workspace
 
 SIMULATE = {"people": 2, "repetitions": 1}
@@ -285,3 +285,30 @@ def test_what_only_looks_is_not_kept(workspace: Workspace, jobs: Jobs) -> None:
     assert job.state == REFUSED and job.message
     until(lambda: job not in jobs.all())
     assert not list((workspace.folder / WORK).glob("*.json"))
+
+
+def test_a_training_begins_in_the_process_that_has_loaded_pytorch(workspace: Workspace, jobs: Jobs) -> None:
+    jobs.warm_up()
+    warm = jobs._warm
+    assert warm is not None
+    jobs.warm_up()
+    assert jobs._warm is warm, "one is enough"
+    other = jobs.start("simulate", spec(workspace, "d", SIMULATE), "simulate")
+    assert jobs._warm is warm
+    first, second = (jobs.start("train", {"dataset": "nowhere"}, "train") for _ in range(2))
+    assert jobs._processes[first.id] is warm and jobs._warm is None
+    assert jobs._processes[second.id] is not warm
+    assert [ended(job).state for job in (other, first, second)] == [DONE, REFUSED, REFUSED]
+    jobs.warm_up()
+    unused = jobs._warm
+    assert unused is not None
+    jobs.close()
+    assert unused.poll() is not None
+
+
+def test_a_warm_process_ends_with_its_studio() -> None:
+    worker = subprocess.Popen(
+        [sys.executable, "-m", "plushsense.studio.tasks", WARM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    out, _ = worker.communicate(timeout=120)
+    assert (worker.returncode, out) == (0, b"")

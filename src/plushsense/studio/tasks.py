@@ -42,7 +42,7 @@ from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
-from plushsense.studio.app.jobs import READY, UNFINISHED
+from plushsense.studio.app.jobs import READY, UNFINISHED, WARM, WARM_S
 from plushsense.studio.app.workspace import folder_digest, refusal_of
 from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
@@ -596,7 +596,16 @@ def main() -> int:
     # Libraries may print, but standard output is reserved for messages.
     out, sys.stdout = sys.stdout, sys.stderr
     reporter = TaskReporter(out)
+    if warm := sys.argv[1:] == [WARM]:
+        importlib.import_module("plushsense.training.fit")
+        end = threading.Timer(WARM_S, os._exit, (0,))
+        end.daemon = True
+        end.start()
     line = sys.stdin.readline()
+    if warm:
+        end.cancel()
+        if not line:
+            return 0
     threading.Thread(target=_end_with_studio, daemon=True).start()
     try:
         request = json.loads(line)

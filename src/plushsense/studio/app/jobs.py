@@ -32,6 +32,11 @@ _MAX_REPORTS = 2000
 # Keys of a spec or result that are never stored, because they identify people.
 _SECRET_KEYS = ("person", "chosen", "receipt")
 _STOP_S = 10.0
+WARM = "warm"
+"""Argument of a worker process that loads PyTorch before it reads its task."""
+WARM_S = 600.0
+"""How long such a process waits for a task, in seconds."""
+_TRAINING = ("make", "train", "evaluate", "sweep", "search")  # tasks for which a warm process is used
 
 
 @dataclass
@@ -79,6 +84,8 @@ class Jobs:
         self.changed = ChangeSignal()
         self._workspace, self._folder = workspace, workspace.folder / WORK
         self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._warm: subprocess.Popen[str] | None = None
+        self._warm_until_s = 0.0
         self._lock = threading.RLock()
         self._jobs: dict[str, StudioJob] = {}
         for folder in self._folder.glob(f"{UNFINISHED}*"):
@@ -119,6 +126,20 @@ class Jobs:
             self._jobs[identity] = job
         self._run(job)
         return job
+
+    def warm_up(self) -> None:
+        """Start a process that loads PyTorch for the next training, unless one waits; it ends after `WARM_S`."""
+        with self._lock:
+            if self._warm is None or self._warm.poll() is not None:
+                with contextlib.suppress(OSError):
+                    self._warm, self._warm_until_s = _worker(WARM), time.monotonic() + WARM_S
+
+    def _take_warm(self) -> subprocess.Popen[str] | None:
+        with self._lock:
+            process, self._warm = self._warm, None
+        # A process that is about to end is left alone.
+        fresh = process is not None and process.poll() is None and time.monotonic() < self._warm_until_s - _STOP_S
+        return process if fresh else None
 
     def check_unused(self, path: Path) -> None:
         """Raise ConfigError if a running job uses the data set or bundle ``path``."""
@@ -181,7 +202,8 @@ class Jobs:
 
     def close(self) -> None:
         """Stop all jobs."""
-        processes = [p for p in self._processes.values() if p.poll() is None]
+        warm = [self._warm] if self._warm is not None else []
+        processes = [p for p in [*self._processes.values(), *warm] if p.poll() is None]
         for process in processes:
             threading.Thread(target=_end, args=(process,), daemon=True).start()
         for process in processes:
@@ -193,17 +215,7 @@ class Jobs:
         try:
             # Store the job first, so that it is found after a crash.
             self._store(job)
-            # -P: nothing is imported from the working folder, which may be a data set of somebody else.
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "plushsense.studio.tasks"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                text=True,
-                encoding="utf-8",
-                start_new_session=True,
-                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
-            )
+            process = (self._take_warm() if job.task in _TRAINING else None) or _worker()
         except OSError as cause:
             job.state, job.refusal, job.ended_s = REFUSED, refusal_of(cause).to_json(), time.time()
             self.changed.notify()
@@ -266,6 +278,20 @@ class Jobs:
             stored["spec"].pop(key, None)
             stored["result"].pop(key, None)
         write_file(self._folder / f"{job.id}.json", json.dumps(stored, default=str))
+
+
+def _worker(*words: str) -> subprocess.Popen[str]:
+    # -P: nothing is imported from the working folder, which may be a data set of somebody else.
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "plushsense.studio.tasks", *words],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        encoding="utf-8",
+        start_new_session=True,
+        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+    )
 
 
 def _end(process: subprocess.Popen[str]) -> None:

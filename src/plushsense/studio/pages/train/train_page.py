@@ -585,6 +585,8 @@ async def show(page: Page) -> None:
         "and compare them."
     )
     ui.label(about).classes("ps-dim")
+    # PyTorch is loaded while the settings are chosen.
+    await run.io_bound(jobs.warm_up)
     rows = await run.io_bound(results.rows)
     form = TrainingForm(page, jobs, results, lambda identity: job_list.open(identity))
     job_list = JobsSection(page, jobs, results, lambda identity: table.open(identity))
