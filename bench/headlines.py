@@ -27,7 +27,7 @@ HAR = ROOT / "examples" / "har-phone.toml"
 TUNED_ON = {f"P{n:02}" for n in range(1, 15)}  # people of makeability on whom the default network was chosen
 CORES = ("xtensa", "cortex-m4", "cortex-m0", "riscv32")
 CORE_NAMES = "lx106 / Cortex-M4 / Cortex-M0+ / RV32"
-RECALLS = ("0.3", "0.4", "0.5", "0.6", "0.7")
+RECALLS = ("0.4", "0.5", "0.6", "0.7")  # at 0.3, not every seed has a setting as strict
 
 NOT_AGAIN = "As documented"  # the note on figures that were not measured again
 
