@@ -93,7 +93,8 @@ def test_what_more_people_would_add_stands_in_the_protocol_if_it_was_measured() 
 def test_what_marks_and_the_layout_changed() -> None:
     dataset = {"recordings": 1200, "excluded": 24, "trimmed": 310, "offsets": {"x": 330.0, "y": 331.5}}
     answers = dict(wording.describe_protocol({"split": "by-subject:5", "dataset": dataset}))
-    told = "24 left out and 310 trimmed. Readings that stand for zero: x 330, y 331.5."
-    assert answers["Data"] == f"Of 1\N{NARROW NO-BREAK SPACE}200 recordings, {told}"
+    told = "Readings that stand for zero: x 330, y 331.5."
+    of = "1\N{NARROW NO-BREAK SPACE}200"
+    assert answers["Data"] == f"Decisions on single recordings leave out 24 and trim 310 of {of}. {told}"
     # As earlier versions stored it.
     assert "Data" not in dict(wording.describe_protocol({"split": "by-subject:5", "dataset": {"recordings": 3}}))

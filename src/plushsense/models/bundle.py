@@ -394,7 +394,7 @@ def _check_size(arch: Arch, layout: Layout) -> None:
     streams = arch.padding == "stream"
     rows = CHUNK if streams else arch.window
     layers = list(zip(arch.layers, arch.inputs, strict=True))
-    kept = (rows + arch.receptive_field) * arch.channels + arch.pooled // arch.step * arch.features
+    kept = (rows + arch.receptive_field) * arch.channels + arch.blocks * arch.layers[-1].filters
     kept += sum((layer.reach + 2 * rows) * max(read, layer.filters) for layer, read in layers)
     taps = max(rows * layer.kernel * read for layer, read in layers)
     if max(kept, taps) > _MOST_NUMBERS:
@@ -402,7 +402,7 @@ def _check_size(arch: Arch, layout: Layout) -> None:
             f"{arch.title} keeps or computes {max(kept, taps):,} numbers at once: accepted are up to "
             f"{_MOST_NUMBERS:,}, so take shorter layers or a shorter window."
         )
-    macs = arch.macs_per_step + (arch.pooled // arch.step * arch.features if streams else 0)
+    macs = arch.macs_per_step + (arch.blocks * arch.layers[-1].filters if streams else 0)
     steps_of_gap = layout.gap_ms * layout.rate_hz / 1000 / arch.step
     if macs > _MOST_MACS or macs * steps_of_gap > _MOST_GAP_MACS:
         raise BundleError(

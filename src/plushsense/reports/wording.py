@@ -96,8 +96,8 @@ def describe_decisions(dataset: Mapping[str, Any]) -> str:
     """Describe what marks and the layout of a data set (`plushsense.dataset.store.Dataset.summary`) changed."""
     zeros = ", ".join(f"{name} {value:g}" for name, value in dataset["offsets"].items())
     return (
-        f"Of {count(dataset['recordings'], 'recordings')}, {count(dataset['excluded'])} left out and "
-        f"{count(dataset['trimmed'])} trimmed." + (f" Readings that stand for zero: {zeros}." if zeros else "")
+        f"Decisions on single recordings leave out {count(dataset['excluded'])} and trim {count(dataset['trimmed'])} "
+        f"of {count(dataset['recordings'])}." + (f" Readings that stand for zero: {zeros}." if zeros else "")
     )
 
 

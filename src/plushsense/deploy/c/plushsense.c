@@ -1242,6 +1242,11 @@ static int is_idle(const plush_toy *toy, uint32_t gesture)
     return (toy->classes_told[gesture] & TOLD_IDLE) != 0;
 }
 
+static uint32_t larger(uint32_t a, uint32_t b)
+{
+    return a > b ? a : b;
+}
+
 /* Of each feature, twice what the sums of its blocks exceed their mean by: how much it changes over time. */
 PLUSH_APART
 static void deviations(plush_toy *toy)
@@ -1250,28 +1255,32 @@ static void deviations(plush_toy *toy)
 
     for (f = 0; f < features; f++) {
         const uint16_t *sum = toy->sums + f;
-        uint32_t mean = toy->total[f] / toy->blocks, beyond = 0;
+        uint32_t mean = toy->total[f] / toy->blocks, all = 0;
 
-        for (left = toy->blocks; left != 0; left--, sum += features)
-            if (*sum > mean)
-                beyond += *sum - mean;
-        toy->total[features + f] = 2 * beyond;
+        /* The larger of both, and the mean subtracted once: an instruction less within the loop. */
+        for (left = toy->blocks; left > 1; left -= 2, sum += 2 * features)
+            all += larger(sum[0], mean) + larger(sum[features], mean);
+        if (left != 0)
+            all += larger(sum[0], mean);
+        toy->total[features + f] = 2 * (all - toy->blocks * mean);
     }
 }
 
 static void dense(plush_toy *toy)
 {
     const uint8_t *scale = toy->dense, *w = toy->dense_weights;
-    uint32_t inputs = pooled(toy), k, f;
+    uint32_t inputs = pooled(toy), all = 0, k, f;
 
     if (toy->deviations)
         deviations(toy);
+    for (f = 0; f < inputs; f++)
+        all += toy->total[f];
     for (k = 0; k < toy->classes; k++, scale += SCALE_BYTES) {
-        uint32_t sum = le32(scale);
+        uint32_t sum = le32(scale) - WEIGHT_ZERO * all; /* modulo 2^32 */
         int32_t t;
 
         for (f = 0; f < inputs; f++)
-            sum += toy->total[f] * ((uint32_t)*w++ - WEIGHT_ZERO);
+            sum += toy->total[f] * *w++;
         t = within(shift_down(as_signed(sum), scale[6]), -32768, 32767);
         t = shift_down(t * (int32_t)le16(scale + 4) + (int32_t)half(scale[7]), scale[7]);
         toy->logits[k] = within(t, -LOGIT_LIMIT, LOGIT_LIMIT);

@@ -48,7 +48,7 @@ extern "C" {
 #define PLUSH_IMAGE_VERSION 11
 #else
 #define PLUSH_IMAGE_VERSION 10
-#endif
+#endif /* and two more, of models that pool deviations beside means: the library reads both */
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255

@@ -398,7 +398,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
     held_back = sorted(known_people(origin, ["validation_subjects"]))
     window_s, step_s = (float(bundle.windowing.get(key) or 1.0) for key in ("window_s", "step_s"))
     trials = scores.get("windows", 0) * min(1.0, step_s / window_s)
-    network = (arch.symbol, *arch.filters, arch.padding, arch.norm)
+    network = (arch.symbol, *arch.filters, arch.padding, arch.norm, arch.pooling)
     used = (origin.get("dataset_hash"), bundle.windowing.get("context"), origin.get("preset"), training, network)
     return [
         ResultRow(
