@@ -18,7 +18,7 @@ from plushsense.deploy.proof.scenarios import exchanges_of
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.deploy.quantize import integer_model
-from plushsense.runtime.image import CALIBRATED, IMAGE_VERSION, IntegerModel, image_head, memory_bytes
+from plushsense.runtime.image import CALIBRATED, DEVIATING, IMAGE_VERSION, IntegerModel, image_head, memory_bytes
 from plushsense.windows.clock import LONG_PAUSE_MS
 from support.c_toy import Seat, seat
 from support.exports import bundle_of, exported
@@ -114,6 +114,7 @@ def test_a_good_checksum_makes_no_calibrated_model(calibrated_library: Any) -> N
     model = calibrated_model()
     body = model.to_bytes()[16:]
     plan = bytes([1, 1, 2, 3, 5])
+    assert model.image_version == IMAGE_VERSION + CALIBRATED + DEVIATING
     at = body.index(plan)
     for what, change in {
         "no sensor": bytes([0]),
@@ -132,11 +133,11 @@ def test_a_good_checksum_makes_no_calibrated_model(calibrated_library: Any) -> N
         "two axes alike": bytes([1, 1, 2, 2, 128 + 5]),
     }.items():
         wrong = body[:at] + change + body[at + min(len(change), len(plan)) :]
-        image = image_head(wrong, version=IMAGE_VERSION + CALIBRATED) + wrong
+        image = image_head(wrong, version=model.image_version) + wrong
         assert Seat(calibrated_library, image, 4, 3).status == DAMAGED, what
     for right in (bytes([1, 1, 2, 3, 128 + 5]), bytes([2, 1, 1, 1, 128 + 5, 3, 3, 3, 128 + 8])):
         other = body[:at] + right + body[at + len(plan) :]
-        image = image_head(other, version=IMAGE_VERSION + CALIBRATED) + other
+        image = image_head(other, version=model.image_version) + other
         assert Seat(calibrated_library, image, 4, 3).status == OK
 
 
