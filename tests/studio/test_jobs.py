@@ -312,3 +312,20 @@ def test_a_warm_process_ends_with_its_studio() -> None:
     )
     out, _ = worker.communicate(timeout=120)
     assert (worker.returncode, out) == (0, b"")
+
+
+def test_a_warm_process_without_pytorch_leaves_the_refusal_to_the_task() -> None:
+    code = (
+        "import sys; sys.modules['torch'] = None; sys.argv = ['tasks', 'warm']; "
+        "from plushsense.studio import tasks; sys.exit(tasks.main())"
+    )
+    worker = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert worker.stdin is not None and worker.stdout is not None
+    worker.stdin.write('{"task": "check", "spec": {"dataset": "nowhere"}}\n')
+    worker.stdin.flush()
+    assert "refused" in json.loads(worker.stdout.readline())
+    assert worker.wait(60) == 2
+    worker.stdin.close()
+    worker.stdout.close()

@@ -597,7 +597,7 @@ def main() -> int:
     out, sys.stdout = sys.stdout, sys.stderr
     reporter = TaskReporter(out)
     if warm := sys.argv[1:] == [WARM]:
-        with contextlib.suppress(ImportError):  # the task says what is missing
+        with contextlib.suppress(Exception):  # the task says what is wrong
             importlib.import_module("plushsense.training.fit")
         end = threading.Timer(WARM_S, os._exit, (0,))
         end.daemon = True
