@@ -165,7 +165,7 @@ class TrainStreams:
 def recipes_for(
     dataset: Dataset, config: RunConfig, run: Run, networks: Collection[str], warn: Warn = silent
 ) -> dict[str, Recipe]:
-    """Return the recipe of each network in ``networks``; they differ in windows, classes and epochs.
+    """Return the recipe of each network in ``networks``; they differ in windows, classes, epochs and stride.
 
     ``run`` are the settings of ``config``, resolved for the data set.
     """
@@ -179,7 +179,8 @@ def recipes_for(
         windows = replace(config.windows, context=context)
         evaluation = replace(config.evaluation, train_context=None)
         spec = with_preset(replace(config, windows=windows, evaluation=evaluation), run.network.symbol).training
-        return replace(resolve_device(run.training), epochs=spec.epochs, halve_every=spec.halve_every)
+        apart = {key: getattr(spec, key) for key in ("epochs", "halve_every", "stride")}
+        return replace(resolve_device(run.training), **apart)
 
     if WINDOWS in networks:
         gestures = choose_classes(dataset, classes, warn)
