@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ArchError
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.deploy.quantize import calibrated, folded, integer_model, refuse_undeployable
+from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.models.reference import Network, random_weights
+from plushsense.models.reference import Network, affine, random_weights
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler, network_inputs
 
@@ -168,10 +168,13 @@ def made_up_frames(layout: Layout, scaler: Scaler | None, n: int, seed: int) -> 
 
 def fold(arch: Arch, weights: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
     """Return the network without normalisation: ``w0 (F, C, K)``, ``b0`` … ``dense_w``, ``dense_b``."""
-    *layers, (dense_w, dense_b) = folded(arch, weights)
-    found = {"dense_w": dense_w, "dense_b": dense_b}
-    for i, (w, b) in enumerate(layers):
-        found |= {f"w{i}": w, f"b{i}": b}
+    gain, shift, found = np.ones(arch.channels), np.zeros(arch.channels), dict[str, Floats]()
+    for i in range(len(arch.layers)):
+        w = weights[f"conv{i}.weight"].astype(np.float64)
+        found |= {f"w{i}": w * gain[:, None], f"b{i}": weights[f"conv{i}.bias"] + w.sum(axis=2) @ shift}
+        gain, shift = affine(arch, i, weights)
+    w = weights["dense.weight"].astype(np.float64)
+    found |= {"dense_w": w * gain, "dense_b": weights["dense.bias"] + w @ shift}
     return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in found.items()}
 
 

@@ -162,22 +162,6 @@ def refuse_undeployable(arch: Arch) -> None:
         )
 
 
-def folded(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> list[tuple[Floats, Floats]]:
-    """Fold each normalisation into the next layer: return weights (F, C, K) and biases (F,) of each layer and the dense
-    one; exact for networks that can be deployed.
-    """
-    gain, shift = np.ones(arch.channels), np.zeros(arch.channels)
-    parts = []
-    for i in range(len(arch.layers)):
-        w = weights[f"conv{i}.weight"].astype(np.float64)
-        parts.append((w * gain[:, None], weights[f"conv{i}.bias"] + w.sum(axis=2) @ shift))
-        gain, shift = affine(arch, i, weights)
-    w = weights["dense.weight"].astype(np.float64)
-    if arch.pooling != "mean":
-        gain, shift = np.concatenate([gain, np.abs(gain)]), np.concatenate([shift, np.zeros(len(shift))])
-    return [*parts, (w * gain, weights["dense.bias"] + w @ shift)]
-
-
 def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ranges: Ranges) -> IntegerNetwork:
     """Quantize the network.
 

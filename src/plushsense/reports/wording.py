@@ -70,7 +70,7 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Folds", count(folds) + (f", {count(sum(sizes))} windows scored" if sizes else "")),
     ]
     if "trimmed" in (dataset := evaluation.get("dataset") or {}):
-        answers.append(("Data", describe_decisions(dataset)))
+        answers.append(("Data", describe_marks(dataset)))
     if evaluation.get("nobody"):
         how = "reported apart" if averaged_over(evaluation) == "subjects" else "counted like all others"
         rest = f"Recordings of nobody (at rest) are spread over the folds by recording and {how}."
@@ -92,7 +92,7 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
     return answers
 
 
-def describe_decisions(dataset: Mapping[str, Any]) -> str:
+def describe_marks(dataset: Mapping[str, Any]) -> str:
     """Describe what marks and the layout of a data set (`plushsense.dataset.store.Dataset.summary`) changed."""
     zeros = ", ".join(f"{name} {value:g}" for name, value in dataset["offsets"].items())
     return (

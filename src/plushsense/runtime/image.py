@@ -127,9 +127,9 @@ class IntegerModel:
                 f"The vector layer of {arch.title} has kernels of {arch.vector.kernel} taps: in the toy there may be "
                 f"at most {MOST_TAPS}."
             )
-        if self.pooled_steps >= 1 << 16:
+        if arch.blocks >= 1 << 16:
             raise BundleError(
-                f"{arch.title} pools {self.pooled_steps} steps: in the toy there may be at most 65535, so take "
+                f"{arch.title} pools {arch.blocks} steps: in the toy there may be at most 65535, so take "
                 "a smaller pool or a longer step."
             )
         if not 1 <= self.smoothing <= 1 << PROBABILITY_BITS:
@@ -160,11 +160,6 @@ class IntegerModel:
         return version + DEVIATING * (self.network.arch.pooling != "mean")
 
     @property
-    def pooled_steps(self) -> int:
-        """Number of steps of which the pooling keeps a sum."""
-        return self.network.arch.blocks
-
-    @property
     def _units_per_ms(self) -> int:
         """Clock units per millisecond: the smallest number for which the period is a whole number of units."""
         return 1000 // math.gcd(1000, self.layout.period_us)
@@ -193,7 +188,7 @@ class IntegerModel:
                     arch.channels,
                     arch.classes,
                     arch.step,
-                    self.pooled_steps,
+                    arch.blocks,
                     arch.span,
                     layout.period_us * units_per_ms // 1000,
                     layout.gap_ms * units_per_ms,
@@ -384,7 +379,7 @@ def memory_bytes(model: IntegerModel) -> int:
         dilation = layer.dilation if layer.kernel > 1 else 1
         pieces.append(dilation * (layer.kernel + SPARE) * _filled(read))
         pieces.append(4 * dilation)  # sums under the taps
-    pieces.append(2 * filters * model.pooled_steps)
+    pieces.append(2 * filters * arch.blocks)
     # Inputs of the dense layer, logits, smoothed probabilities and known.
     pieces += [4 * arch.features, 4 * arch.classes, 4 * arch.classes + 4]
     pieces += [channels, 2 * filters]  # which channels are valid, and the newest features of two positions
